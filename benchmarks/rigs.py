@@ -21,7 +21,7 @@ from nerif.analysis.evaluation import evaluate_views, evaluate_volume
 from nerif.analysis.prediction import reproject
 from nerif.data.measurement import Measurement
 from nerif.data.volume_file import read_volume
-from nerif.reconstruction.aperture import seen_through
+from nerif.reconstruction.aperture import apply_aperture
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.rig.parameters import with_corrections
 from nerif.reconstruction.shared_settings import Aperture, Source
@@ -88,7 +88,7 @@ def measure(
     else:
         result = TotalVariation(aperture=aperture, source=source, device="cpu")(measurement)
     truth = read_volume(path.with_name("truth.nc"))
-    through = seen_through(of_source(measurement, source), aperture)
+    through = apply_aperture(of_source(measurement, source), aperture)
     views = evaluate_views(reproject(result.field, with_corrections(through, result.rig)))
     return {
         "l2": evaluate_volume(result.field, truth, measurement.n_ambient)["l2"],

@@ -132,7 +132,7 @@ def draw(images: Path, project: Path) -> None:
                 driver.save_screenshot(str(images / f"{page.name}.png"))
                 if page.name == "reconstruct":
                     press(driver, "Stop")
-                    wait_for(driver, "document.querySelector('.told').textContent.includes('Stopped')")
+                    wait_for(driver, "document.querySelector('.status').textContent.includes('Stopped')")
         finally:
             driver.quit()
 

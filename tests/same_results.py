@@ -66,6 +66,11 @@ def run(source: Path, folder: Path) -> None:
             sys.exit(f"{source}: nerif {' '.join(arguments)}\n{done.stderr}")
 
 
+def of_clock(row: dict[str, str]) -> bool:
+    """Return whether a record of a training is there because five seconds have passed, not for its step."""
+    return bool(row.get("rays_per_second")) and float(row["step"]) % 20 > 1
+
+
 def numbers(folder: Path) -> dict[str, np.ndarray]:
     """Return every array of the NetCDF files and every column of the histories, but the times."""
     arrays: dict[str, np.ndarray] = {}
@@ -76,7 +81,7 @@ def numbers(folder: Path) -> dict[str, np.ndarray]:
         arrays |= {f"{path.relative_to(folder)}: {name}": value for name, value in found.items()}
     for path in sorted(folder.rglob("history.csv")):
         with path.open() as file:
-            rows = list(csv.DictReader(file))
+            rows = [row for row in csv.DictReader(file) if not of_clock(row)]
         for column in rows[0]:
             if column not in TIMES:
                 values = np.array([float(row[column] or "nan") for row in rows])

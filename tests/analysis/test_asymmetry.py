@@ -102,7 +102,7 @@ def test_a_half_is_withheld_for_cross_validation(jet_file):
     metrics = reconstruct(jet_file, jet_file.parent / "whole")
     assert metrics["cross_validation"]["views"][0]["name"] in ("0deg left", "0deg right")
     assert metrics["verdict"]["word"] in ("use", "use with care")
-    assert metrics["axis"]["told"] == {"shift_1": True, "shift_2": False, "lean_1": True, "lean_2": False}
+    assert metrics["axis"]["constrained"] == {"shift_1": True, "shift_2": False, "lean_1": True, "lean_2": False}
 
 
 def test_a_cross_validation_that_is_stopped_shows_its_halves(tmp_path):

@@ -23,21 +23,21 @@ def main() -> None:
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # whoever has ended is not waited for
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the servers
     for line in iter(sys.stdin.readline, ""):
-        asked = json.loads(line)
+        request = json.loads(line)
         number = os.fork()
         if number == 0:
             if sys.platform == "linux":
                 ctypes.CDLL(None).prctl(WITH_PARENT, signal.SIGKILL)  # it does not outlive tests that were broken off
             signal.signal(signal.SIGCHLD, signal.SIG_DFL)
             signal.signal(signal.SIGINT, signal.default_int_handler)
-            out = os.open(asked["out"], os.O_WRONLY)
+            out = os.open(request["out"], os.O_WRONLY)
             os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
             os.dup2(out, 1)
             os.dup2(out, 2)
             os.close(out)
-            if asked["by"]:
-                os.execvp(asked["by"][0], [*asked["by"], sys.executable, "-m", "nerif", *asked["words"]])
-            sys.exit(nerif(asked["words"]))
+            if request["by"]:
+                os.execvp(request["by"][0], [*request["by"], sys.executable, "-m", "nerif", *request["words"]])
+            sys.exit(nerif(request["words"]))
         print(number, flush=True)
 
 

@@ -112,7 +112,7 @@ def test_a_camera_from_a_ruler(browser, server, folder):
     put(browser, "views", "cam2")
     wait_for(browser, "return document.querySelector('.command code').textContent.includes('--views cam2')")
     browser.find_element("xpath", "//button[contains(., 'Calibrate')]").click()
-    wait_for(browser, "return document.querySelector('.told')?.textContent === 'It is done.'", 60)
+    wait_for(browser, "return document.querySelector('.status')?.textContent === 'It is done.'", 60)
     (camera,) = read_cameras(folder / "calibration.toml")
     assert camera.name == "cam2"
     wait_for(browser, "return document.querySelector('.tabled tbody th').textContent === 'cam2'")
@@ -133,7 +133,7 @@ def test_a_calibration_by_its_settings_file(browser, tmp_path):
         browser.find_element("css selector", "button[aria-label='Leave it out: 10deg/target/3']").click()
         wait_for(browser, "return document.querySelector('.command code').textContent.includes('--leave-out')")
         browser.find_element("xpath", "//button[contains(., 'Calibrate')]").click()
-        wait_for(browser, "return document.querySelector('.told')?.textContent === 'It is done.'", 60)
+        wait_for(browser, "return document.querySelector('.status')?.textContent === 'It is done.'", 60)
         wait_for(browser, "return document.querySelector('.tabled')?.textContent.includes('7 of 7')")
         assert browser.execute_script("return document.querySelectorAll('.tabled tbody tr').length") == 4
         wait_for(browser, "return document.querySelector('.target.left-out')?.textContent.includes('not used')")

@@ -23,7 +23,7 @@ from refusals import refused
 MODULES = ("numpy", "psutil", "torch", "types", "lazy_loader", "multiprocessing", "selectors", "nicegui", "zarr")
 PLANTED = {
     "id": "planted", "title": "<b>planted</b>", "arguments": ["--version"], "attempt": ["--version"], "folder": "/",
-    "out": "../../elsewhere", "asked": "", "place": -1.0, "signature": "0" * 64,
+    "out": "../../elsewhere", "request": "", "place": -1.0, "signature": "0" * 64,
 }  # fmt: skip
 
 

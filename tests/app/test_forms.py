@@ -7,7 +7,7 @@ import dataclasses
 import pytest
 import tyro
 
-from nerif.app.form_view import _meant, _shown
+from nerif.app.form_view import _control_value, _record_value
 from nerif.app.forms import Form
 from nerif.app.pages.reconstruct import form_of
 from nerif.cli.commands.design import Design
@@ -58,7 +58,7 @@ def test_what_is_wrong_stands_beside_its_field(values, name, said):
     assert list(errors) == [name]
     assert said in errors[name]
     with pytest.raises(InputError):
-        FORM.made(values)
+        FORM.build(values)
 
 
 def test_what_is_right_only_beside_another_is_right():
@@ -69,7 +69,7 @@ def test_nested_fields():
     form = form_of("nerif", "fast")
     errors = form.errors({"network.width": 0, "schedule": "constant"})
     assert errors == {"network.width": "Expected at least 1, got 0"}
-    assert form.made({"network.width": 32}).reconstructor.network.width == 32
+    assert form.build({"network.width": 32}).reconstructor.network.width == 32
 
 
 @pytest.mark.parametrize(
@@ -83,13 +83,13 @@ def test_nested_fields():
 def test_the_command_line_gives_the_same_record(values):
     words = FORM.arguments(values)
     assert words[0] == "design"
-    assert parse(Design(), words[1:], "nerif design", "") == FORM.made(values)
+    assert parse(Design(), words[1:], "nerif design", "") == FORM.build(values)
 
 
 def test_the_command_line_of_nested_fields_and_switches_gives_the_same_record():
     form = form_of("nerif", "fast")
     values = {"report": False, "network.gradient_head": True, "weights.head": 0.5, "withhold": ["0deg", "20deg"]}
-    made = form.made(values)
+    made = form.build(values)
     given = dataclasses.replace(form.record, measurement=tyro.MISSING, out=tyro.MISSING)
     parsed = parse(given, ["m.nc", "-o", "x", *form.arguments(values)], "nerif reconstruct", "")
     assert parsed.run == made.run
@@ -101,16 +101,16 @@ def test_defaults_are_not_written():
 
 
 @pytest.mark.parametrize(
-    ("name", "typed", "meant"),
+    ("name", "text", "value"),
     [
         ("views", 5.0, 5), ("f_number", 8, 8.0), ("extra_angles", "10 20.5", [10, 20.5]),
         ("image_size", "48, 64", [48, 64]), ("image_size", "a 4", ["a", 4]), ("temperature", None, None),
     ],
 )  # fmt: skip
-def test_what_is_typed_is_taken_as_it_is_meant(name, typed, meant):
+def test_a_control_value_becomes_that_of_the_record(name, text, value):
     field = FORM.field(name)
-    found = _meant(field, typed)
-    assert found == meant
-    if isinstance(meant, list):
-        assert [type(v) for v in found] == [type(v) for v in meant]
-    assert _shown(field, field.default) is not None or field.optional
+    result = _record_value(field, text)
+    assert result == value
+    if isinstance(value, list):
+        assert [type(v) for v in result] == [type(v) for v in value]
+    assert _control_value(field, field.default) is not None or field.optional

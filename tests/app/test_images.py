@@ -47,12 +47,12 @@ def test_steps_are_undone_and_kept():
     assert edits.undo() == "b"
     assert edits.undo() == "a"
     assert edits.now == {"a": one, "b": Crop()}
-    again = CropEdits({"a": Crop(), "b": Crop()}, edits.kept)
+    again = CropEdits({"a": Crop(), "b": Crop()}, edits.draft)
     assert again.redo() == "a"
     assert again.changed == {"a": other}
     again.put("b", other)
     assert again.redo() == ""
-    assert CropEdits({"b": Crop()}, edits.kept).undo() == ""  # its view has gone
+    assert CropEdits({"b": Crop()}, edits.draft).undo() == ""  # its view has gone
 
 
 def visit(driver: Any, server: Served) -> None:
@@ -94,16 +94,16 @@ def test_reference_and_flow_change_places_by_key_and_clock(browser, server):
     visit(browser, server)
     both = browser.find_element("css selector", ".both")
     both.send_keys(Keys.SPACE)
-    assert text(browser, ".said") == "Flow"
+    assert text(browser, ".current") == "Flow"
     both.send_keys(Keys.SPACE)
-    assert text(browser, ".said") == "Reference"
+    assert text(browser, ".current") == "Reference"
     click(browser, "Blink")
-    wait_for(browser, "return document.querySelector('.said').textContent === 'Flow'")
+    wait_for(browser, "return document.querySelector('.current').textContent === 'Flow'")
     click(browser, "Blink")
     calm = [{"name": "prefers-reduced-motion", "value": "reduce"}]
     browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": calm})
     click(browser, "Blink")
-    assert "less motion" in text(browser, ".calm")
+    assert "Reduced motion" in text(browser, ".calm")
     browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
 
 

@@ -24,7 +24,7 @@ pytestmark = needs_browser
 
 BOUND = ("setpriv", "--bounding-set=-dac_override,-dac_read_search")  # root that rights of files hold for, too
 SMALL = ["--image-size", "20", "24", "--pixel-pitch", "0.18", "--views", "4", "--arc", "0", "135"]
-GOES_ON = "return /It runs.*step [1-9]/.test(document.querySelector('.told')?.textContent)"
+GOES_ON = "return /It runs.*step [1-9]/.test(document.querySelector('.status')?.textContent)"
 
 
 @pytest.fixture(scope="module")
@@ -84,7 +84,7 @@ def test_a_run_goes_on_when_its_server_is_killed(browser, folder):
         wait_for(browser, "return document.querySelectorAll('.images img').length >= 7", 60)
         assert [j.pid for j in Jobs(folder).all()] == [job.pid]  # the same one
         press(browser, "Stop")
-        wait_for(browser, "return document.querySelector('.told').textContent.includes('Stopped')", 120)
+        wait_for(browser, "return document.querySelector('.status').textContent.includes('Stopped')", 120)
     assert (folder / job.out / "volume.nc").is_file()
 
 

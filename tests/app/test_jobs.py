@@ -183,7 +183,15 @@ def test_command_lines_are_quoted():
 @pytest.mark.parametrize("text", ["{", "[" * 100_000, "[1]", '{"id": 1}', "title", "arguments", "words"])
 def test_damaged_files_are_no_runs(tmp_path, text):
     jobs = Jobs(tmp_path)
-    entries = {"id": "bad", "title": "", "arguments": ["info"], "attempt": ["info"], "out": "", "asked": "", "place": 0}
+    entries = {
+        "id": "bad",
+        "title": "",
+        "arguments": ["info"],
+        "attempt": ["info"],
+        "out": "",
+        "request": "",
+        "place": 0,
+    }
     wrong = {"title": {"title": "\ud800"}, "arguments": {"arguments": []}, "words": {"attempt": [1]}}
     bad: Path = jobs.directory / "bad"
     bad.mkdir(parents=True)

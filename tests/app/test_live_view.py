@@ -13,9 +13,9 @@ import pytest
 from app.serving import opened
 from nerif.app.jobs import Jobs
 from nerif.app.live_surface import said_of
-from nerif.app.live_view import told
+from nerif.app.live_view import notice
 from nerif.common.files import write_json
-from nerif.results.directory import LIVE, LIVE_LOOK
+from nerif.results.directory import LIVE, LIVE_FIELD
 from nerif.results.live import read_look
 from report.browsing import errors, needs_browser, requests, text, wait_for
 
@@ -36,7 +36,7 @@ def look(directory: Path, radius: float, seconds: float) -> None:
     view = np.linspace(0, 1, 30, dtype=np.float32).reshape(5, 6, 1)
     part = directory / "part.npz"
     np.savez(part, about=np.array(json.dumps(about)), values=values.astype(np.float32), measured=view, predicted=view)
-    part.replace(directory / LIVE_LOOK)
+    part.replace(directory / LIVE_FIELD)
 
 
 def watched(folder: Path) -> None:
@@ -59,10 +59,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_slow_run_is_shown_to_be_one():
-    job = SimpleNamespace(state="running", asked="")
+    job = SimpleNamespace(state="running", request="")
     live = {"title": "training", "step": 6, "seconds": 100.0, "progress": 0.1, "losses": {}, "remark": "a <b>"}
-    assert told(job, live).endswith("<p class=note>a &lt;b&gt;</p>")
-    assert "note" not in told(job, {**live, "remark": ""})
+    assert notice(job, live).endswith("<p class=note>a &lt;b&gt;</p>")
+    assert "note" not in notice(job, {**live, "remark": ""})
 
 
 def test_a_surface_is_told_in_words(folder, tmp_path):
@@ -81,8 +81,8 @@ def test_the_surface_comes_from_the_folder_alone(server):
     cookie = {"Cookie": server.cookie()}
     assert server.get("/live-surface?of=results/a%20%3Cb%3E&stamp=1", cookie)[0] == 200
     assert server.get("/live-surface?of=results/a%20%3Cb%3E&stamp=1")[0] == 403
-    for asked in ("../x", "results", "%00", "/etc"):
-        assert server.get(f"/live-surface?of={asked}", cookie)[0] == 404
+    for request in ("../x", "results", "%00", "/etc"):
+        assert server.get(f"/live-surface?of={request}", cookie)[0] == 404
 
 
 @needs_browser
@@ -94,8 +94,8 @@ def test_images_and_surface_follow_the_run(browser, server, folder):
     assert "x from -6 to 6" in browser.execute_script(f"return {alt}")
     look(folder / OUT, 8.0, 2.0)
     wait_for(browser, f"return {alt}.includes('x from -8 to 8')")
-    asked = "performance.getEntriesByType('resource').filter(e => /live-surface/.test(e.name))"
-    wait_for(browser, f"return {asked}.length === 2")
+    request = "performance.getEntriesByType('resource').filter(e => /live-surface/.test(e.name))"
+    wait_for(browser, f"return {request}.length === 2")
     surfaces = [address for address in requests(browser) if "/live-surface?" in address]
     assert len(set(surfaces)) == 2
     assert errors(browser) == []

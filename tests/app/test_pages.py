@@ -120,11 +120,11 @@ def test_a_run_is_started_watched_and_stopped(browser, server, folder):
     visit(browser, server, "reconstruct")  # a reload loses nothing
     wait_for(browser, "return document.querySelectorAll('.images img').length >= 7")
     browser.find_element("xpath", "//section[@aria-label='The run']//button[contains(., 'Pause')]").click()
-    wait_for(browser, "return document.querySelector('.told').textContent.includes('Paused')", 120)
+    wait_for(browser, "return document.querySelector('.status').textContent.includes('Paused')", 120)
     assert (out / "checkpoint.safetensors").is_file() or (out / "cross_validation").is_dir()
     browser.find_element("xpath", "//section[@aria-label='The run']//button[contains(., 'Go on')]").click()
-    wait_for(browser, "return /It runs.*step/.test(document.querySelector('.told').textContent)", 120)
+    wait_for(browser, "return /It runs.*step/.test(document.querySelector('.status').textContent)", 120)
     browser.find_element("xpath", "//section[@aria-label='The run']//button[contains(., 'Stop')]").click()
-    wait_for(browser, "return document.querySelector('.told').textContent.includes('Stopped')", 120)
+    wait_for(browser, "return document.querySelector('.status').textContent.includes('Stopped')", 120)
     assert (out / "volume.nc").is_file()
     assert errors(browser) == []

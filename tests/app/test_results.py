@@ -235,6 +235,6 @@ def test_reports_and_surfaces_come_from_the_folder_alone(server):
     assert (status, answer) == (200, REPORT)
     assert headers["content-security-policy"].startswith("sandbox allow-scripts allow-downloads; default-src 'none'")
     assert server.get("/report?of=results/a%20%3Cb%3E")[0] == 403
-    for asked in ("/report?of=../x", "/report?of=results", "/report?of=%00", "/surface?of=/etc&quantity=n"):
-        assert server.get(asked, cookie)[0] == 404
+    for request in ("/report?of=../x", "/report?of=results", "/report?of=%00", "/surface?of=/etc&quantity=n"):
+        assert server.get(request, cookie)[0] == 404
     assert server.get("/surface?of=film.zarr&quantity=index_excess&level=x", cookie)[0] == 404

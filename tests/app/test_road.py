@@ -110,7 +110,7 @@ def images(driver: Any) -> None:
     """All images can be used."""
     go(driver, "Images")
     wait_for(driver, "return document.querySelectorAll('.view .pair img').length === 8")
-    wait_for(driver, "return document.querySelector('.told').textContent.startsWith('4 views. Nothing is wrong')")
+    wait_for(driver, "return document.querySelector('.status').textContent.startsWith('4 views. Nothing is wrong')")
 
 
 def calibration(driver: Any, target: dict[str, Any]) -> None:
@@ -129,8 +129,8 @@ def calibration(driver: Any, target: dict[str, Any]) -> None:
     fill(driver, "axes", " ".join(target["axes"]))
     wait_for(driver, "return document.querySelectorAll('.target circle').length > 50")
     click(driver, "Calibrate")
-    wait_for(driver, "return /^It (is done|failed)/.test(document.querySelector('.told')?.textContent)", 60)
-    assert text(driver, ".told") == "It is done."
+    wait_for(driver, "return /^It (is done|failed)/.test(document.querySelector('.status')?.textContent)", 60)
+    assert text(driver, ".status") == "It is done."
     wait_for(driver, "return document.querySelectorAll('.tabled tbody tr').length === 4")
 
 
@@ -175,7 +175,7 @@ def reconstruct(driver: Any) -> None:
     words = line(driver)
     assert words[:3] == ["nerif", "reconstruct", "measurement.nc"]
     click(driver, "Start")
-    wait_for(driver, "return document.querySelector('.told').textContent.includes('It has ended')", 90)
+    wait_for(driver, "return document.querySelector('.status').textContent.includes('It has ended')", 90)
 
 
 def results(driver: Any, folder: Path) -> None:

@@ -106,7 +106,7 @@ def test_a_collapsed_run_is_reported_and_exits_with_1(work, tmp_path, capsys):
     metrics = metrics_of(tmp_path / "r")
     assert metrics["outcome"] == "collapsed"
     assert "--learning-rate" in metrics["message"]
-    assert "taken_back" in (tmp_path / "r/history.csv").read_text().splitlines()[0]
+    assert "rolled_back" in (tmp_path / "r/history.csv").read_text().splitlines()[0]
     assert "The field collapsed to the ambient. " in (tmp_path / "r/report.html").read_text()
     assert bool(torch.isfinite(read_volume(tmp_path / "r/volume.nc").values).all())
 

@@ -21,7 +21,7 @@ TEXTS = sorted(
     for path in (*ROOT.glob("*"), *(p for folder in FOLDERS for p in (ROOT / folder).rglob("*")))
     if path.is_file() and (path.suffix in ENDINGS or path.name == "Makefile") and "_build" not in path.parts
 )
-FOREIGN = re.compile(r"(?<![\w.-])nerif\\?\[\w|pip3? install(?: -\S+)* [\"'`]?nerif(?![\w-])")
+FOREIGN = re.compile(r"(?<![\w.-])nerif\\?\[[\w,]+\\?\]|pip3? install(?: -\S+)* [\"'`]?nerif(?![\w-])")
 
 
 def test_no_text_installs_the_other_package():

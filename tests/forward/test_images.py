@@ -1,4 +1,4 @@
-"""Images: references moved by what a field does to the light are what flow images are."""
+"""Images: the flow image is the reference displaced by the field."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from scipy.ndimage import map_coordinates
 from nerif.analysis.evaluation import evaluate_views, evaluate_volume
 from nerif.analysis.prediction import predict, reproject
 from nerif.cli.cli import main
-from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
 from nerif.data.volume import Volume
 from nerif.fields.network import NetworkShape
@@ -42,7 +41,7 @@ GREYS = 20.0  # sigma
 
 
 def pattern(view: int, column: np.ndarray, row: np.ndarray) -> np.ndarray:
-    """Grey values of a background of so many waves, none shorter than 4 px, anywhere between pixels."""
+    """Grey values of a background of WAVES waves, none shorter than 4 px, at any position."""
     draw = np.random.default_rng(view)
     angle, length = draw.uniform(0, math.pi, WAVES), draw.uniform(4, 12, WAVES)
     phase = draw.uniform(0, 2 * math.pi, WAVES)
@@ -50,24 +49,19 @@ def pattern(view: int, column: np.ndarray, row: np.ndarray) -> np.ndarray:
     return 2000 + 3000 / math.sqrt(WAVES) * np.cos(2 * math.pi * along / length + phase).sum(axis=-1)
 
 
-def photographed(balls: GaussianBalls, gain: float = 0.0, noise: float = GREYS, focal: float = 1.0) -> Measurement:
-    """Flow images of a field, their references, and the displacement as windows see it; gains drift over a view."""
-    cameras = replace(RING, pixel_pitch=RING.pixel_pitch / focal).cameras()
-    seen = predict(balls, cameras, BOX, 1.00027)
-    d = seen.displacements
-    row, column = (x.astype(float) for x in np.mgrid[: d.shape[1], : d.shape[2]])
-    draw = np.random.default_rng(5)
-    references, flows = [], []
-    for i, own in enumerate(d.double().numpy()):
-        bright = 1 + gain * column / d.shape[2]
-        references.append(pattern(i, column, row) + noise / 3 * draw.standard_normal(row.shape))
-        moved = pattern(i, column - own[..., 0], row - own[..., 1])
-        flows.append(bright * moved + 300 * gain + noise * draw.standard_normal(row.shape))
-    maps = {
-        name: torch.tensor(np.stack(images)).float() for name, images in (("reference", references), ("flow", flows))
-    }
-    maps["image_sigma"] = torch.full_like(maps["flow"], 1.05 * noise)
-    return replace(seen, maps=maps, displacement=None)
+def photographed(balls: GaussianBalls, gain: float = 0.0) -> Measurement:
+    """Flow images of a field and their references, with noise; the gain drifts over a view."""
+    measurement = predict(balls, RING.cameras(), BOX, 1.00027)
+    row, column = (x.astype(float) for x in np.mgrid[: measurement.shape[1], : measurement.shape[2]])
+    draw, maps = np.random.default_rng(5), {"reference": [], "flow": []}
+    for i, d in enumerate(measurement.displacements.double().numpy()):
+        maps["reference"].append(pattern(i, column, row) + GREYS / 3 * draw.standard_normal(row.shape))
+        displaced = pattern(i, column - d[..., 0], row - d[..., 1])
+        bright = (1 + gain * column / row.shape[1]) * displaced + 300 * gain
+        maps["flow"].append(bright + GREYS * draw.standard_normal(row.shape))
+    maps = {name: torch.tensor(np.stack(images)).float() for name, images in maps.items()}
+    maps["image_sigma"] = torch.full_like(maps["flow"], 1.05 * GREYS)
+    return replace(measurement, maps=maps, displacement=None)
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +73,20 @@ def balls() -> GaussianBalls:
 
 @pytest.fixture(scope="module")
 def taken(balls) -> Measurement:
+    """Images of the balls."""
     return photographed(balls)
+
+
+@pytest.fixture(scope="module")
+def d(balls, taken) -> torch.Tensor:
+    """Displacements of the balls."""
+    return predict(balls, taken.cameras, BOX, 1.00027).displacements
+
+
+@pytest.fixture(scope="module")
+def both(taken, d) -> Measurement:
+    """Images and displacements."""
+    return replace(taken, displacement=d, sigma=torch.full_like(d, 0.05))
 
 
 def error(balls: GaussianBalls, result) -> float:
@@ -109,20 +116,17 @@ def test_the_reference_between_pixels_is_the_cubic_spline():
 
 
 @pytest.mark.parametrize(("height", "width"), [(1, 9), (2, 7), (6, 2), (1, 1)])
-def test_a_image_of_few_rows_has_a_reference_too(height, width):
+def test_an_image_of_few_rows_has_a_reference_too(height, width):
     image = torch.rand(1, height, width, generator=torch.Generator().manual_seed(0)) * 100
-    references = References(image, [(height, width)])
     row, column = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     place = torch.stack([column, row], dim=-1).reshape(-1, 2).float()
-    view = torch.zeros(len(place), dtype=torch.int16)
-    torch.testing.assert_close(references.at(view, place), image.flatten(), rtol=1e-4, atol=1e-3)
-    between = place[:, 1] * 0 + (height - 1) / 2, place[:, 0] * 0 + (width - 1) / 2
-    right = map_coordinates(image[0].double().numpy(), [b.numpy() for b in between], order=3, mode="mirror")
-    torch.testing.assert_close(references.at(view, torch.stack(between[::-1], dim=-1)).double(), torch.tensor(right),
-                               rtol=1e-4, atol=1e-3)  # fmt: skip
+    place = torch.cat([place, torch.tensor([[(width - 1) / 2, (height - 1) / 2]])])
+    values = References(image, [(height, width)]).at(torch.zeros(len(place), dtype=torch.int16), place)
+    exact = map_coordinates(image[0].double().numpy(), place.flip(-1).T.numpy(), order=3, mode="mirror")
+    torch.testing.assert_close(values.double(), torch.tensor(exact).double(), rtol=1e-4, atol=1e-3)
 
 
-def test_pixels_without_a_reference_are_not_known():
+def test_pixels_without_a_reference_are_not_covered():
     images = torch.rand(1, 20, 20) * 100
     images[0, 4:7, 4:7] = torch.nan
     references = References(images, [(20, 20)])
@@ -131,7 +135,7 @@ def test_pixels_without_a_reference_are_not_known():
     assert bool(references.at(torch.zeros(2, dtype=torch.int16), place).isfinite().all())
 
 
-def test_gain_and_offset_are_found_among_outliers():
+def test_gain_and_offset_are_fitted_despite_outliers():
     draw = torch.Generator().manual_seed(0)
     references = References(torch.rand(1, 60, 60, generator=draw) * 1000, [(60, 60)])
     pixel = torch.rand(3000, 2, generator=draw) * 57 + 1
@@ -146,39 +150,32 @@ def test_gain_and_offset_are_found_among_outliers():
 # -- the model -------------------------------------------------------------------------------------------------------
 
 
-def test_the_truth_leaves_the_noise(balls, taken):
-    (observation,) = taken.observations
-    rays, values, sigma = taken.rays(observation)
-    model = forward_model(Images, taken)
-    d = predict(balls, taken.cameras, BOX, 1.00027).displacements[rays.view.long(), *rays.pixel.long().flip(-1).T]
-    left = model.residual(d, values, rays) / sigma
-    assert float(left.square().mean().sqrt()) == pytest.approx(1, abs=0.12)  # noise, and what splines miss
-    assert float((model.residual(0 * d, values, rays) / sigma).square().mean().sqrt()) > 3
+def test_the_residual_of_the_truth_is_noise(taken, d):
+    rays, values, sigma = taken.rays(taken.observations[0])
+    model, d = forward_model(Images, taken), d[rays.view.long(), *rays.pixel.long().flip(-1).T]
+    residual, empty = (model.residual(x, values, rays) / sigma for x in (d, 0 * d))
+    assert float(residual.square().mean().sqrt()) == pytest.approx(1, abs=0.12)  # noise, and the error of splines
+    assert float(empty.square().mean().sqrt()) > 3
 
 
-def test_the_linear_model_is_the_slope_of_the_warped_one(taken):
-    seen = of_source(taken, "images", 0.0)
-    guess = torch.full((*seen.shape, 2), 0.3)
-    seen = replace(seen, maps={**seen.maps, Images.guess: guess})
-    rays, values, _ = seen.rays()
+def test_the_linear_model_is_the_slope_of_the_displaced_one(taken):
+    guessed = of_source(taken, "images", 0.0)
+    guessed = replace(guessed, maps={**guessed.maps, Images.guess: torch.full((*guessed.shape, 2), 0.3)})
+    rays, values, _ = guessed.rays()
     inner = ((rays.pixel - 20).abs() < 14).all(dim=-1)
     rays, values = rays[inner], values[inner]
-    model = forward_model(Images, seen)
+    model = forward_model(Images, guessed)
     twin = model.linear_twin
-    measured, _ = twin.reading(values, None, rays)
     s, step = (rays.near + rays.far)[:, None] / 2, (rays.far - rays.near)[:, None]
     gradient = 1e-6 * torch.randn(len(rays), 1, 3, generator=torch.Generator().manual_seed(0))
-    straight = LeverArm(taken.n_ambient).weights(rays, s, step)(None, gradient)
-    d = torch.full((len(rays), 2), 0.3) + straight
-    linear = twin.weights(rays, s, step)(None, gradient) - (measured - 0)
-    at_guess = twin.weights(rays, s, step)
-    moved = model.residual(d, values, rays) - model.residual(torch.full_like(d, 0.3), values, rays)
-    assert torch.allclose(at_guess(None, gradient), moved, rtol=0.05, atol=1.0)
-    # at a displacement of the guess itself, what is left is that of the warped image
-    slope = -twin._slope(rays)  # type: ignore[attr-defined]
-    there = (slope * 0.3).sum(dim=-1, keepdim=True) - measured
-    assert torch.allclose(there, model.residual(torch.full_like(d, 0.3), values, rays), atol=0.5)
-    assert linear.shape == values.shape
+    guess = torch.full((len(rays), 2), 0.3)
+    d = guess + LeverArm(taken.n_ambient).weights(rays, s, step)(None, gradient)
+    change = model.residual(d, values, rays) - model.residual(guess, values, rays)
+    assert torch.allclose(twin.weights(rays, s, step)(None, gradient), change, rtol=0.05, atol=1.0)
+    # at the guess itself the residuals are equal
+    measured, _ = twin.reading(values, None, rays)
+    at_guess = -(twin._slope(rays) * 0.3).sum(dim=-1, keepdim=True) - measured  # type: ignore[attr-defined]
+    assert torch.allclose(at_guess, model.residual(guess, values, rays), atol=0.5)
 
 
 @pytest.mark.parametrize("cone", [None, 8.0])
@@ -196,7 +193,7 @@ def test_the_adjoint_of_linear_images_is_exact(taken, cone):
     assert float((operator(x) * y).sum()) == pytest.approx(float((x * operator.T(y)).sum()), rel=1e-10)
 
 
-def test_outliers_pull_by_their_size_alone(taken):
+def test_outliers_have_the_slope_of_the_huber_loss(taken):
     (part,) = Target.of(of_source(taken, "images")).parts
     part = part[:50]
     d = torch.zeros(50, 2, requires_grad=True)
@@ -212,7 +209,7 @@ def test_outliers_pull_by_their_size_alone(taken):
 # -- reconstructions -------------------------------------------------------------------------------------------------
 
 
-def test_images_that_are_not_there_are_asked_for_in_one_line(balls, tmp_path, capsys):
+def test_missing_images_are_reported_in_one_line(balls, tmp_path, capsys):
     predict(balls, RING.cameras(), BOX, 1.00027).write(tmp_path / "m.nc")
     assert main(["reconstruct", str(tmp_path / "m.nc"), "-o", str(tmp_path / "r"), "--from", "images"]) == 2
     (line,) = "".join(capsys.readouterr()).splitlines()
@@ -227,8 +224,7 @@ def test_networks_and_voxels_find_the_field_in_images(balls, taken):
 
 @pytest.mark.slow
 def test_a_drift_of_the_light_is_fitted(balls):
-    drifting = photographed(balls, gain=0.05)
-    assert error(balls, NETWORK(drifting)) < 0.16
+    assert error(balls, NETWORK(photographed(balls, gain=0.05))) < 0.16
 
 
 @pytest.mark.slow
@@ -240,81 +236,66 @@ def test_shifts_of_several_pixels_are_found_without_displacements(balls):
     assert error(far, replace(NETWORK, max_steps=400)(m)) < 0.15
 
 
+def names_of(measurement: Measurement) -> list[str]:
+    return sorted(o.technique.name for o in measurement.observations)
+
+
 @pytest.mark.slow
-def test_images_go_on_from_displacements(balls, taken):
-    d = predict(balls, taken.cameras, BOX, 1.00027).displacements
-    both = replace(taken, displacement=d + 0.05, sigma=torch.full_like(d, 0.05))
-    parts = stages(both, "auto")
-    assert [[o.technique.name for o in part.measurement().observations] for part in parts[:2]] == [
-        ["deflection"],
-        ["images"],
-    ]
+def test_images_follow_displacements(balls, taken, both, d):
+    biased = replace(both, displacement=d + 0.05)
+    parts = stages(biased, "auto")
+    assert [names_of(part.measurement()) for part in parts[:2]] == [["deflection"], ["images"]]
     assert torch.equal(parts[1].measurement().maps[Images.guess], (d + 0.05).float())
-    assert error(balls, NETWORK(both)) < 0.15
-    assert [o.technique.name for o in of_source(both, "auto", preferred="displacements").observations] == ["deflection"]
-    together = replace(NETWORK, source="both", max_steps=60)(both)
-    assert not together.outcome.failed
+    assert error(balls, NETWORK(biased)) < 0.15
+    assert names_of(of_source(biased, "auto", preferred="displacements")) == ["deflection"]
+    assert not replace(NETWORK, source="both", max_steps=60)(biased).outcome.failed
 
 
-def test_a_run_tells_where_images_take_over_and_its_pace_goes_on(balls, taken):
-    """There are fewer pixels of images than displacements, so that fewer rays are counted from then on."""
-    d = predict(balls, taken.cameras, BOX, 1.00027).displacements
+def test_a_run_notes_where_images_follow_and_its_pace_continues(taken, both):
+    """There are fewer pixels of images than displacements, so fewer rays are counted from then on."""
     flow = taken.maps["flow"].clone()
     flow[:, ::2] = torch.nan
-    both = replace(taken, displacement=d, sigma=torch.full_like(d, 0.05), maps={**taken.maps, "flow": flow})
+    fewer = replace(both, maps={**taken.maps, "flow": flow})
     settings, steps = replace(NETWORK, max_steps=12, network=NetworkShape(depth=1, width=8)), []
-    Trainer(settings, TrainingData(settings, both)).run(steps.append)
-    assert [(s.step, s.note) for s in steps if s.note] == [
-        (5, "the loss changes from displacements to images and jumps")
-    ]
+    Trainer(settings, TrainingData(settings, fewer)).run(steps.append)
+    assert [s.step for s in steps if s.note] == [5]
     assert all(s.rays_per_second > 0 for s in steps)
 
 
-def test_shifts_of_images_are_refined_of_the_displacements_that_are_there(balls, taken):
-    d = predict(balls, taken.cameras, BOX, 1.00027).displacements
-    both = replace(taken, displacement=d, sigma=torch.full_like(d, 0.05))
+def test_shifts_of_images_are_refined_from_displacements(both):
     shifted = replace(NETWORK, refine=("cameras,shift",))
     data = TrainingData(shifted, both)
-    assert [[o.technique.name for o in stage.measurement().observations] for stage in data.stages] == [["deflection"]]
+    assert [names_of(stage.measurement()) for stage in data.stages] == [["deflection"]]
     assert data.refinement is not None
     with refused("refine"):
         TrainingData(replace(shifted, source="images"), both)
 
 
-def test_what_is_measured_by_other_techniques_stays(balls, taken):
-    """Fringes beside images and displacements, in a view that has nothing else too."""
-    d = predict(balls, taken.cameras, BOX, 1.00027).displacements
+def test_data_of_other_techniques_are_unchanged(balls, taken, d):
+    """Fringes beside images and displacements, also in a view that has nothing else."""
     fringes = predict(balls, taken.cameras, BOX, 1.00027, technique=Interferometry, wavelength_nm=532.0).maps["fringes"]
-    d[3] = math.nan
-    flow = taken.maps["flow"].clone()
-    flow[3] = math.nan
-    whole = replace(
-        taken, displacement=d, sigma=torch.full_like(d, 0.05), wavelength_nm=532.0,
-        maps={**taken.maps, "flow": flow, "fringes": fringes},
-    )  # fmt: skip
-    for source, expected in (
-        ("auto", ["images", "interferometry"]),
-        ("images", ["images", "interferometry"]),
-        ("displacements", ["deflection", "interferometry"]),
-        ("both", ["deflection", "images", "interferometry"]),
-    ):
-        found = of_source(whole, source)
-        assert sorted(o.technique.name for o in found.observations) == expected
-        assert found.names == whole.names
+    d, flow = d.clone(), taken.maps["flow"].clone()
+    d[3] = flow[3] = math.nan
+    maps = {**taken.maps, "flow": flow, "fringes": fringes}
+    whole = replace(taken, displacement=d, sigma=torch.full_like(d, 0.05), wavelength_nm=532.0, maps=maps)
+    image, deflection = ["images", "interferometry"], ["deflection", "interferometry"]
+    sources = {"auto": image, "images": image, "displacements": deflection, "both": ["deflection", *image]}
+    for source, names in sources.items():
+        data = of_source(whole, source)
+        assert names_of(data) == names
+        assert data.names == whole.names
     assert of_source(replace(taken, displacement=d), "displacements").names == whole.names[:3]
 
 
 def test_a_run_from_images_resumes_bit_for_bit(taken):
-    whole = replace(NETWORK, max_steps=40)
-    states = []
+    settings, states = replace(NETWORK, max_steps=40, network=NetworkShape(depth=2, width=16)), {}
 
-    def keep(step) -> bool:
+    def keep(step) -> None:
         if step.step == 25:
-            states.append(step.capture())
-        return False
+            states[25] = step.capture()
 
-    once = Trainer(whole, TrainingData(whole, taken)).run(keep)
-    again = Trainer(whole, TrainingData(whole, taken), states[0]).run()
+    once = Trainer(settings, TrainingData(settings, taken)).run(keep)
+    again = Trainer(settings, TrainingData(settings, taken), states[25]).run()
     a, b = (dict(r.field.network.state_dict()) for r in (once, again))
     assert all(torch.equal(a[name], b[name]) for name in a)
 
@@ -327,7 +308,7 @@ def test_without_a_limit_a_run_is_judged_by_pixels_withheld(taken):
     judges = TrainingData(settings, taken, withhold=True).withheld
     assert judges is not None
     assert len(judges) > 200
-    assert held[-1] < 0.5 * math.sqrt(judges.chi_square)  # of what is left of them without a field
+    assert held[-1] < 0.5 * math.sqrt(judges.chi_square)  # the residual without a field
 
 
 def test_views_are_compared_as_images(balls, taken):
@@ -339,7 +320,7 @@ def test_views_are_compared_as_images(balls, taken):
     assert max(v["rms_over_sigma"] for v in scores) < 1.1
 
 
-def test_threads_that_score_views_share_what_one_built(balls, taken, monkeypatch):
+def test_threads_that_score_views_share_the_references(balls, taken, monkeypatch):
     built, init = [], References.__init__
 
     def recorded(self, *arguments):
@@ -352,61 +333,49 @@ def test_threads_that_score_views_share_what_one_built(balls, taken, monkeypatch
     assert built == [threading.main_thread()]
 
 
-# -- files, and what is refused --------------------------------------------------------------------------------------
+# -- files and invalid input -----------------------------------------------------------------------------------------
 
 
-def test_files_hold_images_beside_displacements(tmp_path, balls, taken):
-    d = predict(balls, taken.cameras, BOX, 1.00027).displacements
-    both = replace(taken, displacement=d, sigma=torch.full_like(d, 0.05))
-    for name, measurement in (("alone", taken), ("both", both)):
-        path = tmp_path / f"{name}.nc"
-        measurement.write(path)
-        read = Measurement.read(path)
-        assert [o.technique.name for o in read.observations] == [o.technique.name for o in measurement.observations]
-        for key, value in measurement.maps.items():
-            assert torch.equal(read.maps[key], value)
-    with xr.open_dataset(tmp_path / "both.nc", engine="h5netcdf") as data:
+def test_files_hold_images_beside_displacements(tmp_path, taken, both):
+    for measurement in (taken, both):
+        measurement.write(tmp_path / "m.nc")
+        read = Measurement.read(tmp_path / "m.nc")
+        assert names_of(read) == names_of(measurement)
+        assert all(torch.equal(read.maps[name], value) for name, value in measurement.maps.items())
+    with xr.open_dataset(tmp_path / "m.nc", engine="h5netcdf") as data:
         assert data.attrs["technique"] == "deflection images"
         assert data["reference"].attrs["units"] == "grey value"
 
 
-def test_the_noise_of_images_may_be_told_by_attributes(tmp_path, taken):
+def test_the_noise_of_images_may_be_given_by_attributes(taken):
     plain = {name: value for name, value in taken.maps.items() if name != "image_sigma"}
     dataset = replace(taken, maps=plain).to_dataset()
     dataset.attrs |= {"read_noise": 10.0, "electrons_per_grey_value": [2.0, 4.0, 4.0, 4.0]}
-    read = Measurement.from_dataset(dataset)
-    sigma = read.maps["image_sigma"]
-    both = (taken.maps["flow"] + taken.maps["reference"]).clamp(min=0).mean(dim=(1, 2))  # as bright as each other
-    each = torch.tensor([2.0, 4, 4, 4])
-    assert torch.allclose(sigma.square().mean(dim=(1, 2)), 200 + both / each, rtol=0.02)
-    assert float(sigma.std() / sigma.mean()) < 0.3  # a mean over dots, that does not choose among pixels
+    sigma = Measurement.from_dataset(dataset).maps["image_sigma"]
+    grey = (taken.maps["flow"] + taken.maps["reference"]).clamp(min=0).mean(dim=(1, 2))  # as bright as each other
+    assert torch.allclose(sigma.square().mean(dim=(1, 2)), 200 + grey / torch.tensor([2.0, 4, 4, 4]), rtol=0.02)
+    assert float(sigma.std() / sigma.mean()) < 0.3  # a local mean, which does not select pixels
     dataset.attrs["read_noise"] = [1.0, 2.0]
     with refused("attribute read_noise"):
         Measurement.from_dataset(dataset)
-
-
-def test_noise_told_by_attributes_has_rounding_in_it_and_no_gaps(taken):
     flow, reference = (taken.maps[name].clone() for name in ("flow", "reference"))
     flow[0, :3], reference[1, 5:9, 5:9] = math.nan, math.nan
     sigma = Images.complete({"flow": flow, "reference": 2 * reference}, {"read_noise": 0})["image_sigma"]
     assert torch.equal(sigma.isfinite(), flow.isfinite())
-    assert torch.allclose(sigma[2:], torch.tensor(math.sqrt(1.25 / 12)), rtol=0.01)  # half the gain: a quarter
+    assert torch.allclose(sigma[2:], torch.tensor(math.sqrt(1.25 / 12)), rtol=0.01)  # rounding; half the gain
 
 
-def test_what_is_missing_is_told(taken, balls):
-    with refused("reference"):
-        replace(taken, maps={"flow": taken.maps["flow"]})
-    with refused("reference"):
-        replace(taken, maps={**taken.maps, "reference": taken.maps["reference"][:, :-1]})
-    with refused("from"):
-        of_source(taken, "displacements")
-    displaced = predict(balls, taken.cameras, BOX, 1.00027)
-    with refused("from"):
-        NeRIF(source="images")(displaced)
-    with refused("source"):
-        NeRIF(source="image")
-    with pytest.raises(InputError, match="technique: images need a pattern; simulate them with nerif render"):
-        predict(balls, taken.cameras, BOX, 1.00027, technique=Images)
-    grey = {**taken.maps, "flow": torch.ones_like(taken.maps["flow"])}
-    with pytest.raises(InputError, match="flow: expected an image of a pattern, got one of a single grey"):
-        replace(taken, maps=grey)
+def test_missing_and_impossible_images_are_refused(taken, balls):
+    maps, displaced = taken.maps, predict(balls, taken.cameras, BOX, 1.00027)
+    cases = [
+        ("reference", lambda: replace(taken, maps={"flow": maps["flow"]})),
+        ("reference", lambda: replace(taken, maps={**maps, "reference": maps["reference"][:, :-1]})),
+        ("flow", lambda: replace(taken, maps={**maps, "flow": torch.ones_like(maps["flow"])})),
+        ("from", lambda: of_source(taken, "displacements")),
+        ("from", lambda: NeRIF(source="images")(displaced)),
+        ("source", lambda: NeRIF(source="image")),
+        ("technique", lambda: predict(balls, taken.cameras, BOX, 1.00027, technique=Images)),
+    ]
+    for field, make in cases:
+        with refused(field):
+            make()

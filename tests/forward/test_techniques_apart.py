@@ -1,4 +1,4 @@
-"""A field belongs to the techniques that see it: whatever takes both refuses those that see another."""
+"""A field belongs to techniques of its quantity: commands that take both refuse others."""
 
 from __future__ import annotations
 
@@ -47,35 +47,30 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return found
 
 
-def test_a_result_is_not_scored_by_a_technique_that_sees_something_else(files):
-    directory = ResultDirectory(files["emission"].with_suffix(""))
-    kept = (directory / REPROJECTION).read_bytes()
-    message = r"deflection.nc: expected a technique that measures the field of radiance per length \(emission\)"
+def test_fields_of_another_quantity_are_refused(files, tmp_path, capsys):
+    """When a result is scored, projected, or the start of a reconstruction."""
+    results = {name: path.with_suffix("") for name, path in files.items()}
+    before = (results["emission"] / REPROJECTION).read_bytes()
+    message = r"deflection.nc: expected a technique .* the field of radiance per length \(emission\), got deflec"
     with pytest.raises(InputError, match=message):
-        evaluate(directory.path, measurement=files["deflection"])
-    assert (directory / REPROJECTION).read_bytes() == kept
-
-
-def test_a_technique_sees_no_field_of_another_quantity(files, tmp_path, capsys):
+        evaluate(results["emission"], measurement=files["deflection"])
+    assert (results["emission"] / REPROJECTION).read_bytes() == before
     out = tmp_path / "p.nc"
-    words = ["project", str(files["deflection"].with_suffix("")), "-o", str(out)]
-    assert main([*words, "--technique", "absorption"]) == 2
-    said = capsys.readouterr().err
-    assert "technique: expected a technique that measures the field of refractive index (deflection, interfero" in said
+    assert main(["project", str(results["deflection"]), "-o", str(out), "--technique", "absorption"]) == 2
+    error = capsys.readouterr().err
+    assert "technique: expected a technique" in error
+    assert "the field of refractive index (deflection, interfero" in error
     assert not out.exists()
-    field, box, n_ambient = ResultDirectory(files["deflection"].with_suffix("")).field()
+    field, box, n_ambient = ResultDirectory(results["deflection"]).field()
     with refused("technique"):
         predict(field, RING.cameras(), box, n_ambient, technique=Absorption, quantity="index_excess")
-
-
-def test_a_reconstruction_starts_from_no_field_of_another_quantity(files, tmp_path):
-    run = Run(start_from=files["deflection"].with_suffix(""), report=False)
+    run = Run(start_from=results["deflection"], report=False)
     with pytest.raises(InputError, match=r"start_from .*deflection: expected a technique .*, got emission"):
         reconstruct_into(tmp_path / "r", files["emission"], QUICK, run)
     assert not (tmp_path / "r").exists()
 
 
-def test_what_the_reconstruction_knows_of_another_technique_is_not_forced_on_this_one(files, tmp_path, monkeypatch):
+def test_settings_of_another_technique_do_not_apply(files, tmp_path, monkeypatch):
     """The model of the run stays with its technique, and the wavelength comes with the cameras of a file."""
     result, out = files["deflection"].with_suffix(""), tmp_path / "p.nc"
     kept = ResultDirectory.settings
@@ -90,8 +85,8 @@ def test_what_the_reconstruction_knows_of_another_technique_is_not_forced_on_thi
 # -- gains of cameras ----------------------------------------------------------------------------------------------
 
 
-def test_gains_that_were_fitted_stay_with_the_result(files, tmp_path):
-    """Evaluated again from the same file, the scores are those of the run, and so are the views."""
+def test_gains_are_part_of_the_result(files, tmp_path):
+    """Scores and views evaluated again from the same file are those of the run."""
     even = Measurement.read(files["emission"])
     gains = dict(zip(even.names, (0.5, 1.6, 1.0, 1.25), strict=True))
     uneven = tmp_path / "uneven.nc"
@@ -109,13 +104,13 @@ def test_gains_that_were_fitted_stay_with_the_result(files, tmp_path):
     out.write_settings(settings, {"gains": {"0deg": 0}})
     with refused("gains of run.toml"):
         evaluate(out.path, measurement=uneven)
-    out.write_settings(settings)  # forgotten, the views are not what the field was fitted to
+    out.write_settings(settings)  # without them the views are not those that were fitted
     evaluate(out.path, measurement=uneven)
     assert out.metrics()["views"][0]["rms"] > 1.5 * before[0]["rms"]
 
 
 @pytest.mark.parametrize("left", [0.0, 1e-3])
-def test_a_view_that_shows_nothing_is_refused_by_name(files, left):
+def test_a_dark_view_is_refused(files, left):
     even = Measurement.read(files["emission"])
     radiance = even.maps["radiance"].clone()
     radiance[2] *= left
@@ -123,12 +118,15 @@ def test_a_view_that_shows_nothing_is_refused_by_name(files, left):
         fit_gains(replace(even, maps={"radiance": radiance}))
 
 
-# -- what each technique is asked ----------------------------------------------------------------------------------
+# -- commands ------------------------------------------------------------------------------------------------------
 
 
-def test_a_simulation_names_its_technique_and_takes_a_peak_only_where_it_counts(files, tmp_path, capsys):
+def test_technique_and_peak_of_a_simulation_and_units_of_info(files, tmp_path, capsys):
     assert main(["simulate", "--technique", "-o", str(tmp_path / "m.nc")]) == 2
     assert "technique: expected one or more of deflection" in capsys.readouterr().err
+    for name, head in (("deflection", "rms displacement [px]"), ("emission", "rms radiance [1]")):
+        assert main(["info", str(files[name])]) == 0
+        assert head in capsys.readouterr().out
     with refused("peak"):
         Simulation(peak=0.1)
     with refused("peak"):
@@ -138,14 +136,8 @@ def test_a_simulation_names_its_technique_and_takes_a_peak_only_where_it_counts(
     assert float(measurement.maps["radiance"].nan_to_num().max()) > 0
 
 
-def test_columns_of_info_have_their_units(files, capsys):
-    for name, head in (("deflection", "rms displacement [px]"), ("emission", "rms radiance [1]")):
-        assert main(["info", str(files[name])]) == 0
-        assert head in capsys.readouterr().out
-
-
-def test_flow_that_leaves_through_a_face_is_told_where_no_gauge_names_the_face():
-    """The faces that a file names by default fix nothing of an emission: it may leave through them."""
+def test_flow_that_leaves_through_a_face_is_reported_without_a_gauge():
+    """The default faces of a file are no gauge of an emission: it may leave through them."""
     wide, box = Box((-25.0, -10.0, -10.0), (15.0, 10.0, 10.0)), Box((-5.0, -10.0, -10.0), (15.0, 10.0, 10.0))
     inside, outside = torch.tensor([[6.0, 1.0, 1.0]]), torch.tensor([[-8.0, 0.0, 0.0]])
     ball = GaussianBalls(inside, torch.tensor([2.0]), torch.tensor([0.1]))
@@ -159,8 +151,8 @@ def test_flow_that_leaves_through_a_face_is_told_where_no_gauge_names_the_face()
     assert open_faces(both, replace(small, box=wide)) == []
 
 
-def test_noise_below_zero_is_no_mistake_in_a_check():
-    """Of a view that shows a few things only, most pixels are noise about 0; the small images have no sigma."""
+def test_negative_noise_is_no_mistake_in_a_check():
+    """Most pixels of a view may be noise about 0; binned images have no sigma."""
     simulation = Simulation("flame", ("emission",), noise=0.3, steps=10, truth_voxels=8)
     measurement, _ = simulation(replace(RING, image_size=(36, 37), pixel_pitch=0.11).cameras())
     assert float(measurement.maps["radiance"].min()) < 0

@@ -1,4 +1,4 @@
-"""What people look at is right for each technique: names, units, colours, quantities and sentences."""
+"""Report, figures, notebooks and files have the names, units, colours and quantities of each technique."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def test_views_have_a_row_for_each_component_and_colours_for_what_it_measures(ab
     assert [*residuals_over_sigma(reprojections[1])] == ["displacement", "fringes"]
 
 
-def test_figures_have_the_labels_of_the_technique(absorption):
+def test_figures_have_the_labels_and_units_of_the_technique(absorption, monkeypatch):
     result = ResultDirectory(absorption).read()
     assert error_of(result) is not None
     labels = {}
@@ -113,21 +113,11 @@ def test_figures_have_the_labels_of_the_technique(absorption):
     assert "error of extinction coefficient [mm⁻¹]" in labels["comparison"]
     assert "absorbance [1]" in labels["view_0deg"]
     assert not any("displacement" in text or "kg" in text for text in labels.values())
-
-
-def test_a_difference_has_the_unit_of_its_technique(absorption, monkeypatch):
-    result = ResultDirectory(absorption).read()
     monkeypatch.setattr(Absorption, "unit", "dB")
-    labels = [axes.get_ylabel() for axes in view(result.reprojection, 0, 190).axes]
-    assert "difference [dB]" in labels
+    assert "difference [dB]" in [axes.get_ylabel() for axes in view(result.reprojection, 0, 190).axes]
 
 
-def test_a_plain_quantity_is_packed_as_it_is():
-    relation = packing.relation("extinction", {})
-    assert (relation["offset"], relation["factor"], relation["lower"], relation["upper"]) == (0, 1, None, None)
-
-
-def test_files_say_what_they_hold(absorption, both, tmp_path, capsys):
+def test_files_name_their_field(absorption, both, tmp_path, capsys):
     volume = read_volume(absorption / "volume.nc")
     assert (volume.quantity, volume.unit) == ("extinction", "mm-1")
     assert volume.attributes["title"] == "Field of extinction coefficient"
@@ -140,41 +130,38 @@ def test_files_say_what_they_hold(absorption, both, tmp_path, capsys):
     assert main(["export", str(absorption), "-o", str(tmp_path / "b.nc"), "--quantities", "density"]) == 2
     assert "expected one of extinction, got 'density'" in capsys.readouterr().err
     assert main(["info", str(absorption)]) == 0
-    said = capsys.readouterr().out
-    assert "reconstruction of extinction coefficient" in said
-    assert "n_ambient" not in said
-    # the field is found among its statistics
-    named = [replace(volume, quantity=f"extinction{ending}") for ending in ("", "_std")]
-    write_netcdf(tmp_path / "e.nc", named)
+    output = capsys.readouterr().out
+    assert "reconstruction of extinction coefficient" in output
+    assert "n_ambient" not in output
+    # the field is recognised among its statistics
+    write_netcdf(tmp_path / "e.nc", [replace(volume, quantity=f"extinction{ending}") for ending in ("", "_std")])
     assert read_volume(tmp_path / "e.nc").quantity == "extinction"
     assert field_of(["density", "temperature"]) is None
+    relation = packing.relation("extinction", {})  # packed unchanged
+    assert (relation["offset"], relation["factor"], relation["lower"], relation["upper"]) == (0, 1, None, None)
+    grid = Grid(Box.cube(4.0), (2, 3, 4))  # only an index has an ambient
+    assert Volume.of(torch.zeros(grid.shape), grid, "emission", 1.00027).attributes == {}
+    assert Volume.of(torch.zeros(grid.shape), grid, INDEX, 1.00027).n_ambient == 1.00027
 
 
 def test_notebooks_show_each_technique(both, absorption):
-    shown = Measurement.read(both.with_suffix(".nc"))._repr_html_()
-    assert "Displacement u and v of each view, in px" in shown
-    assert "Fringes of each view" in shown
-    alone = Measurement.read(absorption.with_suffix(".nc"))._repr_html_()
+    combined, alone = (Measurement.read(p.with_suffix(".nc"))._repr_html_() for p in (both, absorption))
+    assert "Displacement u and v of each view, in px" in combined
+    assert "Fringes of each view" in combined
     assert "Absorbance of each view" in alone
     assert "Ambient" not in alone
-    volume = read_volume(absorption / "volume.nc")
-    assert "mm⁻¹" in volume._repr_html_()
+    assert "mm⁻¹" in read_volume(absorption / "volume.nc")._repr_html_()
 
 
-def test_metrics_of_displacements_alone_are_still_read(absorption):
-    """As versions that knew no other technique wrote them."""
-    out = ResultDirectory(absorption)
-    kept = (out.path / "metrics.json").read_text()
-    old = {"views": [{"name": "0deg", "withheld": False, "cc": 0.9, "rms_px": 0.25}]}
-    try:
-        (out.path / "metrics.json").write_text(json.dumps(old))
-        [view] = out.metrics()["views"]
-    finally:
-        (out.path / "metrics.json").write_text(kept)
+def test_metrics_of_displacements_alone_are_still_read(absorption, tmp_path):
+    """As written by versions without other techniques."""
+    metrics = {"views": [{"name": "0deg", "withheld": False, "cc": 0.9, "rms_px": 0.25}]}
+    (tmp_path / "metrics.json").write_text(json.dumps(metrics))
+    [view] = ResultDirectory(tmp_path).metrics()["views"]
     assert (view["measured"], view["unit"], view["rms"]) == ("displacement", "px", 0.25)
 
 
-def test_mistakes_are_those_that_a_technique_can_make(both, absorption):
+def test_mistakes_considered_are_those_that_a_technique_can_have(both, absorption):
     combined, alone = (Measurement.read(p.with_suffix(".nc")) for p in (both, absorption))
     pairs = [(o, m.cameras) for m in (combined, alone) for o in m.observations]
     said = [[c.words for c in of_one_view(0, o, cameras)] for o, cameras in pairs]
@@ -201,7 +188,7 @@ def test_an_observation_alone_is_a_measurement_of_its_views(both):
     assert fewer.observations[0].alone(fewer).names == combined.names
 
 
-def test_an_offset_of_the_background_is_told(absorption):
+def test_an_offset_of_the_background_is_reported(absorption):
     alone = Measurement.read(absorption.with_suffix(".nc"))
     shifted = replace(alone, maps={**alone.maps, "absorbance": alone.maps["absorbance"] + 0.4})
     first = image_remarks(shifted, shifted, [1.0] * 3)[0]
@@ -236,9 +223,3 @@ def test_maps_that_cannot_be_negative_begin_at_zero():
     assert drawing.map_range(values, signed=False) == (0.0, 2.0)
     assert drawing.map_range(values, signed=True) == (-2.0, 2.0)
     assert drawing.map_range(np.array([np.nan]), signed=True) == (-1.0, 1.0)
-
-
-def test_a_volume_of_an_index_alone_has_an_ambient():
-    grid = Grid(Box.cube(4.0), (2, 3, 4))
-    assert Volume.of(torch.zeros(grid.shape), grid, "emission", 1.00027).attributes == {}
-    assert Volume.of(torch.zeros(grid.shape), grid, INDEX, 1.00027).n_ambient == 1.00027

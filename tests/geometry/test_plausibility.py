@@ -1,4 +1,4 @@
-"""Rigs that cannot be as their calibration says are named with the likely cause; right ones are left in peace."""
+"""Implausible rigs are reported with the likely cause, plausible ones without any finding."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def test_the_unit_of_the_box_is_named():
     assert likely_cause(ring(), scaled(1e3)).startswith("likely box in micrometres")
 
 
-def test_no_cause_is_made_up():
+def test_without_a_likely_cause_the_general_checks_are_named():
     aside = [replace(c, translation=c.translation + torch.tensor([300.0, 0.0, 0.0])) for c in ring()]
     assert likely_cause(aside, BOX) == "check units (mm), poses (world to camera) and names of views"
 
@@ -139,13 +139,13 @@ RIGHT = {
 
 
 @pytest.mark.parametrize("name", RIGHT)
-def test_right_rigs_are_left_in_peace(name):
+def test_plausible_rigs_have_no_finding(name):
     assert rig_findings(*RIGHT[name]) == []
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(not RIGS, reason="no rigs beside the repository")
-def test_rigs_of_files_are_left_in_peace():
+def test_rigs_of_files_are_plausible():
     for path in RIGS:
         if "truth" not in path.name:
             measurement = Measurement.read(path)

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from nerif.geometry import PROJECTIONS, Box, Camera, Lens, Plane, Rays
-from nerif.geometry.pose import GEOMETRY, Corrections, turned
+from nerif.geometry.pose import GEOMETRY, Corrections, rotation_matrix
 
 BOX = Box((-25.0,) * 3, (25.0,) * 3)
 
@@ -17,7 +17,7 @@ def camera(projection: str, lens: Lens | None, turn: float) -> Camera:
     """Askew, distorted, before a slanted background."""
     scale = 900.0 if projection == "perspective" else 2.0
     k = torch.tensor([[scale, 0.003 * scale, 60], [0, 0.98 * scale, 50], [0, 0, 1]], dtype=torch.float64)
-    rotation = turned(torch.tensor([0.1, turn, 0.2], dtype=torch.float64))
+    rotation = rotation_matrix(torch.tensor([0.1, turn, 0.2], dtype=torch.float64))
     translation = torch.tensor([3.0, 4.0, 500.0], dtype=torch.float64)
     normal = torch.nn.functional.normalize(rotation[2] + torch.tensor([0.05, 0.02, 0.1]).double(), dim=0)
     behind = float(normal @ (-rotation.T @ translation + 900 * rotation[2]))
@@ -40,19 +40,19 @@ def test_rays_move_as_those_of_the_corrected_cameras(projection, lens, backgroun
     corrections = Corrections(cameras, torch.randn(2, 8, generator=torch.Generator().manual_seed(0)).double() * sizes)
     pixels = torch.rand(50, 2, generator=torch.Generator().manual_seed(1)).double() * 100
 
-    def seen(by) -> Rays:
+    def rays_of(by) -> Rays:
         return Rays.concatenate([c.rays(pixels, True, i).clip(BOX) for i, c in enumerate(by)])
 
-    expected, found = seen(corrections.corrected), corrections.moved(seen(cameras), BOX)
-    assert float((expected.direction - seen(cameras).direction).abs().max()) > 1e-3
-    pairs = [(getattr(expected, n), getattr(found, n)) for n in ("origin", "direction", "near", "far")]
+    expected, result = rays_of(corrections.corrected), corrections.apply(rays_of(cameras), BOX)
+    assert float((expected.direction - rays_of(cameras).direction).abs().max()) > 1e-3
+    pairs = [(getattr(expected, n), getattr(result, n)) for n in ("origin", "direction", "near", "far")]
     if background:
-        pairs += [(getattr(expected.ends, n), getattr(found.ends, n)) for n in ("sensitivity", "distance")]
+        pairs += [(getattr(expected.ends, n), getattr(result.ends, n)) for n in ("sensitivity", "distance")]
     if lens is not None:
-        pairs += [(getattr(expected.lens, n), getattr(found.lens, n)) for n in ("axis", "normal", "radius", "focus")]
-    for wanted, got in pairs:
-        assert torch.allclose(wanted, got, rtol=1e-9, atol=1e-8)
-    assert torch.equal(found.view, expected.view)
+        pairs += [(getattr(expected.lens, n), getattr(result.lens, n)) for n in ("axis", "normal", "radius", "focus")]
+    for a, b in pairs:
+        assert torch.allclose(a, b, rtol=1e-9, atol=1e-8)
+    assert torch.equal(result.view, expected.view)
 
 
 @pytest.mark.parametrize("order", [("perspective", "telecentric"), ("telecentric", "perspective")])
@@ -66,7 +66,7 @@ def test_a_rig_may_mix_cameras_with_and_without_a_beginning_of_their_rays(order)
     rays = Rays.concatenate([c.rays(pixels, True, i).clip(BOX) for i, c in enumerate(cameras)])
     half = int(50 * order.index("telecentric"))
     assert bool((rays.near[half : half + 50] < -5).any())  # its plane z_cam = 0 cuts the box
-    moved = Corrections(cameras, torch.zeros(2, len(GEOMETRY))).moved(rays, BOX)
+    moved = Corrections(cameras, torch.zeros(2, len(GEOMETRY))).apply(rays, BOX)
     through = rays.spread(1)
     for found in (moved, through, rays[torch.arange(100)]):
         assert torch.allclose(found.near, rays.near, atol=1e-9)

@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from nerif.common.conventions import FACES, InputError, parse_faces
+from nerif.common.conventions import FACES, parse_faces
 from nerif.geometry import TELECENTRIC, Box, Grid, Rays, Ring, paper_rig
 from refusals import refused
 
@@ -59,11 +59,6 @@ def test_box_and_faces():
         others = [a for a in range(3) if a != axis]
         assert float(points[:, others].std(dim=0).min()) > 0
         assert bool(((points >= torch.tensor(BOX.lower)) & (points <= torch.tensor(BOX.upper))).all())
-    for lower, upper in (((0, 0, 0), (1, 0, 1)), ((0, 0, 0), (1, -1, 1)), ((0, 0, 0), (1, math.nan, 1))):
-        with refused("box"):
-            Box(lower, upper)
-    with refused("ambient_faces"):
-        parse_faces("x- up")
 
 
 def test_grid_is_indexed_z_y_x_at_voxel_centres():
@@ -74,8 +69,6 @@ def test_grid_is_indexed_z_y_x_at_voxel_centres():
     assert points[4, 1, 1].tolist() == [1.25, 1.0, 1.5]
     assert points[0, 0, 0].tolist() == [-0.25, -1.0, -2.5]
     assert Grid.of_resolution(BOX, 27).shape == (27, 18, 9)
-    with refused("grid"):
-        Grid(BOX, (0, 3, 2))
 
 
 def test_paper_rig():
@@ -103,9 +96,6 @@ def test_ring_settings():
     assert ring.cameras()[0].centre.tolist() == pytest.approx([100 * math.cos(math.pi / 6), 0, 50])
     with refused("views"):
         Ring(views=3, arc=(0, 90), extra_angles=(45,)).cameras()
-    for name in ("views", "focal_length", "pixel_pitch", "distance", "background_distance"):
-        with pytest.raises(InputError, match=name):
-            Ring(**{name: -1})
 
 
 def test_a_telecentric_ring_sees_as_much_as_its_lens_magnifies():
@@ -122,34 +112,41 @@ def test_a_telecentric_ring_sees_as_much_as_its_lens_magnifies():
 
 
 @pytest.mark.parametrize(
-    ("settings", "words"),
+    ("settings", "field"),
     [
-        ({"projection": "fisheye"}, "projection: expected one of perspective, telecentric, got 'fisheye'"),
-        ({"magnification": 0.1}, "magnification: expected a positive number, with projection = telecentric"),
-        ({"magnification": -0.1, "projection": "telecentric"}, "magnification: expected a positive number"),
+        ({"projection": "fisheye"}, "projection"),
+        ({"magnification": 0.1}, "magnification"),
+        ({"magnification": -0.1, "projection": "telecentric"}, "magnification"),
+        ({"views": 0}, "views"),
+        ({"distance": -1.0}, "distance"),
+        ({"focal_length": math.inf}, "focal_length"),
+        ({"elevation": math.nan}, "elevation"),
+        ({"image_size": (0, 4)}, "image_size"),
     ],
 )
-def test_lenses_that_cannot_be(settings, words):
-    with pytest.raises(InputError, match=words):
+def test_rings_that_cannot_be(settings, field, unchecked):
+    with refused(field):
         Ring(**settings)
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("views", 0), ("distance", -1.0), ("focal_length", math.inf), ("elevation", math.nan)]
-)
-def test_rings_that_cannot_be(name, value, unchecked):
-    with pytest.raises(InputError, match=f"{name}: expected"):
-        Ring(**{name: value})
+    ("lower", "upper"),
+    [((0, 0, 0), (1, 0, 1)), ((0, 0, 0), (1, -1, 1)), ((0, 0, 0), (1, 1, math.nan)), ((1e6, 0, 0), (1e6 + 1, 1, 1)),
+     ((0, 0, 0), (1e9, 1, 1))],
+)  # fmt: skip
+def test_boxes_that_cannot_be(lower, upper):
+    with refused("box"):
+        Box(lower, upper)
 
 
-def test_boxes_and_grids_that_cannot_be(unchecked):
-    for lower, upper in (((0, 0, 0), (1, 1, math.nan)), ((1e6, 0, 0), (1e6 + 1, 1, 1)), ((0, 0, 0), (1e9, 1, 1))):
-        with refused("box"):
-            Box(lower, upper)
+def test_grids_and_faces_that_cannot_be(unchecked):
+    for shape in ((0, 3, 2), (1.5, 2, 2)):
+        with refused("grid"):
+            Grid(BOX, shape)
     with refused("voxels"):
-        Grid.of_resolution(Box.cube(1.0), 0)
-    with refused("grid"):
-        Grid(Box.cube(1.0), (1.5, 2, 2))
+        Grid.of_resolution(BOX, 0)
+    with refused("ambient_faces"):
+        parse_faces("x- up")
 
 
 def test_a_box_around_the_origin_and_what_it_holds():

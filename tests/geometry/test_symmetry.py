@@ -1,8 +1,9 @@
-"""Which places of a symmetric flow are alike, and the box that they fill."""
+"""Coordinates of symmetric fields, and the box in them."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import asdict
 
 import pytest
 import torch
@@ -21,9 +22,9 @@ def about(text="axis", point=(1.0, 2.0, 0.0), direction=(0.1, -0.05, 1.0), round
     return found
 
 
-@pytest.mark.parametrize(("text", "found"), [("none", None), ("axis", ("axis", 0)), ("axis+3", ("axis", 3))])
-def test_names_are_understood(text, found):
-    assert parse_symmetry(text) == found
+@pytest.mark.parametrize(("text", "parsed"), [("none", None), ("axis", ("axis", 0)), ("axis+3", ("axis", 3))])
+def test_names_are_parsed(text, parsed):
+    assert parse_symmetry(text) == parsed
 
 
 @pytest.mark.parametrize("text", ["axes", "axis+", "axis+9", "planar+1", ""])
@@ -37,7 +38,7 @@ def test_an_axis_without_a_direction_is_refused():
         about(direction=(0.0, 0.0, 0.0))
 
 
-def test_points_turned_about_the_axis_are_alike():
+def test_coordinates_do_not_depend_on_the_azimuth():
     symmetry, angle = about(rounding=1e-6), torch.tensor(1.1, dtype=torch.float64)
     r, h = torch.tensor([0.0, 3.0, 9.0], dtype=torch.float64), torch.tensor([-4.0, 0.0, 11.0], dtype=torch.float64)
     for turn in (0.0, 0.4, 2.0):
@@ -45,7 +46,7 @@ def test_points_turned_about_the_axis_are_alike():
         assert torch.allclose(found, torch.stack([r, torch.zeros(3), h], dim=1).double(), atol=1e-5)
 
 
-def test_points_along_the_line_of_a_planar_flow_are_alike():
+def test_coordinates_of_a_planar_field_are_constant_along_its_direction():
     symmetry = about("planar", direction=(0.0, 1.0, 0.2))
     p = torch.rand(9, 3, dtype=torch.float64)
     along = torch.tensor(symmetry.direction, dtype=torch.float64)
@@ -82,16 +83,14 @@ def test_faces_of_the_box_are_named_as_those_of_the_reduced_one():
 
 def test_moving_an_axis_there_and_back_leaves_it_where_it_was():
     start = about()
-    there = start.moved((0.5, -0.2), (0.01, 0.02))
-    still = there.moved((0.0, 0.0), (0.0, 0.0))
+    there = start.move((0.5, -0.2), (0.01, 0.02))
+    still = there.move((0.0, 0.0), (0.0, 0.0))
     assert (still.matrix - there.matrix).abs().max() < 1e-12
     lean = torch.tensor(there.direction, dtype=torch.float64) @ start.matrix.T
     assert (lean[:2] / lean[2]).tolist() == pytest.approx([0.01, 0.02])
     assert (there.matrix @ there.matrix.T - torch.eye(3)).abs().max() < 1e-12
 
 
-def test_what_a_file_keeps_is_what_comes_back():
-    from dataclasses import asdict
-
+def test_a_symmetry_comes_back_from_its_entries():
     symmetry = about("axis+2")
-    assert Symmetry.kept(asdict(symmetry)) == symmetry
+    assert Symmetry.from_entries(asdict(symmetry)) == symmetry

@@ -1,4 +1,4 @@
-"""What a notebook has: names under `nerif`, loaded when asked for, and nouns that show themselves."""
+"""Notebook display of measurements, volumes and results; names under `nerif`, loaded when first used."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def test_every_name_is_there_and_at_home(name):
     assert found is getattr(sys.modules[found.__module__], name)
 
 
-def test_importing_loads_nothing_until_a_name_is_asked_for():
+def test_names_are_loaded_when_first_used():
     code = "import sys, nerif; heavy = {'torch', 'numpy'} & {*sys.modules}; print(len(heavy), nerif.Box.cube(2.0))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.startswith("0 Box(")

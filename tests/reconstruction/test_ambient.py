@@ -1,4 +1,4 @@
-"""An index excess is counted from an ambient: truths and phantoms over another one are converted, or refused."""
+"""Truths and phantoms with another ambient index are converted, or refused without one."""
 
 from __future__ import annotations
 
@@ -51,34 +51,27 @@ def test_an_excess_is_converted_to_another_ambient(truth):
     n = Volume(truth.values.double() + N_AMBIENT, truth.grid, "n")
     torch.testing.assert_close(n.relative_to(N_AMBIENT).values, truth.values, atol=1e-9, rtol=0)
     assert truth.relative_to(N_AMBIENT) is truth
-    with pytest.raises(InputError, match="attribute n_ambient"):
-        replace(truth, attributes={}).relative_to(N_AMBIENT)
-    with pytest.raises(InputError, match="index_excess or n, got 'density'"):
-        replace(truth, quantity="density").relative_to(N_AMBIENT)
+    for changes, message in (({"attributes": {}}, "n_ambient"), ({"quantity": "density"}, "index_excess or n")):
+        with pytest.raises(InputError, match=message):
+            replace(truth, **changes).relative_to(N_AMBIENT)
 
 
-def test_a_perfect_field_scores_so_against_a_truth_over_another_ambient(truth, perfect, tmp_path):
+def test_a_perfect_field_has_no_error_against_a_truth_over_another_ambient(truth, perfect, tmp_path):
     path = tmp_path / "t.nc"
     write_netcdf(path, [over_vacuum(truth)])
     metrics = evaluate(perfect.path, truth=path)
     assert metrics["l2_variation"] < 1e-3
     assert perfect.metrics()["l2"] == metrics["l2"]
-    result = replace(perfect.read(), volumes={})
-    assert result.truth is not None
     perfect.write_volumes([truth])
-    shown = perfect.read().truth
-    assert shown is not None
-    torch.testing.assert_close(shown.values, truth.values, atol=1e-9, rtol=0)
+    torch.testing.assert_close(perfect.read().truth.values, truth.values, atol=1e-9, rtol=0)
 
 
 def test_a_truth_over_an_unknown_ambient_is_refused(truth, perfect, tmp_path, capsys):
-    path = tmp_path / "t.nc"
-    write_netcdf(path, [replace(truth, attributes={})])
-    assert main(["evaluate", str(perfect.path), "--truth", str(path)]) == 2
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1
-    assert "t.nc" in said
-    assert "n_ambient" in said
+    write_netcdf(tmp_path / "t.nc", [replace(truth, attributes={})])
+    assert main(["evaluate", str(perfect.path), "--truth", str(tmp_path / "t.nc")]) == 2
+    [line] = capsys.readouterr().err.splitlines()
+    assert "t.nc" in line
+    assert "n_ambient" in line
 
 
 def test_frames_are_compared_with_truths_over_another_ambient(measurement, tmp_path):
@@ -102,8 +95,8 @@ def test_frames_are_compared_with_truths_over_another_ambient(measurement, tmp_p
 
 
 @pytest.mark.parametrize("n_ambient", [N_AMBIENT, None])
-def test_a_phantom_is_what_its_file_says(truth, cameras, tmp_path, n_ambient):
-    """Over the ambient that is asked for, or else that of the file."""
+def test_a_phantom_from_a_file_has_its_ambient(truth, cameras, tmp_path, n_ambient):
+    """Over the ambient of the settings, or else that of the file."""
     path: Path = tmp_path / "own.nc"
     own = over_vacuum(truth) if n_ambient else truth
     write_netcdf(path, [own])

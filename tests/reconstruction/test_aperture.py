@@ -1,4 +1,4 @@
-"""Reconstruction through lenses: what their cones see is what is compared, and knowing of them pays."""
+"""Lenses and correlation windows: projections are means over them, which improves the reconstruction."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from nerif.forward.images import Images
 from nerif.forward.path_integral import PathIntegral, project
 from nerif.forward.registry import forward_model
 from nerif.geometry import Box, Grid, Lens, Ring
-from nerif.reconstruction.aperture import lens_rays, seen_through
+from nerif.reconstruction.aperture import apply_aperture, lens_rays
 from nerif.reconstruction.neural.losses import LossWeights, MixedPrecision
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.neural.objective import Objective
@@ -46,40 +46,46 @@ def flame():
 
 @pytest.fixture(scope="module")
 def wide() -> Measurement:
-    """Through lenses of 12.5 mm, whose cones are some 5 mm wide in the flow."""
+    """Through lenses of 12.5 mm, whose cones are about 5 mm wide in the flow."""
     cameras = tuple(replace(c, lens=Lens(12.5, points=12)) for c in RING.cameras())
     return simulate(flame(), cameras, BOX, 1.00027, 0.02, 1, 40)
 
 
-def test_the_path_integral_through_a_lens_is_what_curved_rays_see(wide):
-    camera, ball = replace(wide.cameras[1], lens=Lens(12.5, points=100)), make_phantom("gaussians", BOX, seed=1)
-    exact = view_displacement(ball, camera, BOX, 1.00027, 40)
-    thin = view_displacement(ball, replace(camera, lens=None), BOX, 1.00027, 40)
-    found = predict_view(ball, camera, PathIntegral(forward_model(wide.techniques[0], wide), 80), BOX)
-    scale = float(exact.std())
-    assert float((exact - thin).std()) > 0.03 * scale
-    assert float((exact - found).std()) < 0.005 * scale
+def predicted(wide: Measurement, camera) -> torch.Tensor:
+    model = forward_model(wide.techniques[0], wide)
+    return predict_view(make_phantom("gaussians", BOX, seed=1), camera, PathIntegral(model, 80), BOX)
+
+
+def simulated(camera, steps: int = 40) -> torch.Tensor:
+    return view_displacement(make_phantom("gaussians", BOX, seed=1), camera, BOX, 1.00027, steps)
+
+
+def test_the_path_integral_through_a_lens_agrees_with_curved_rays(wide):
+    camera = replace(wide.cameras[1], lens=Lens(12.5, points=100))
+    exact, thin = simulated(camera), simulated(replace(camera, lens=None))
+    assert float((exact - thin).std()) > 0.03 * float(exact.std())
+    assert float((exact - predicted(wide, camera)).std()) < 0.005 * float(exact.std())
 
 
 def test_a_displacement_over_a_window_is_the_mean_over_its_pixels(wide):
-    ball, edge = make_phantom("gaussians", BOX, seed=1), 3
+    edge = 3
     camera = replace(wide.cameras[1], lens=Lens(window=float(edge)))
     fine = replace(camera, lens=None, intrinsics=camera.intrinsics * torch.tensor([[5.0, 1, 5], [1, 5, 5], [1, 1, 1]]))
     fine = replace(fine, intrinsics=fine.intrinsics + torch.tensor([[0, 0, 2.0], [0, 0, 2], [0, 0, 0]]))
     height, width = camera.image_size
-    thin = view_displacement(ball, replace(fine, image_size=(5 * height, 5 * width)), BOX, 1.00027, 40) / 5
-    means = torch.nn.functional.avg_pool2d(thin.permute(2, 0, 1), 5 * edge, stride=5).permute(1, 2, 0)
-    found = predict_view(ball, camera, PathIntegral(forward_model(wide.techniques[0], wide), 80), BOX)
-    simulated = view_displacement(ball, replace(camera, lens=replace(camera.lens, points=100)), BOX, 1.00027, 40)
-    exact, scale = means, float(means.std())
+    thin = simulated(replace(fine, image_size=(5 * height, 5 * width))) / 5
+    exact = torch.nn.functional.avg_pool2d(thin.permute(2, 0, 1), 5 * edge, stride=5).permute(1, 2, 0)
     inner = slice(edge // 2, height - edge // 2), slice(edge // 2, width - edge // 2)
-    assert float((found[inner] - exact).std()) < 0.03 * scale
-    assert float((simulated[inner] - exact).std()) < 0.03 * scale
-    smooth = view_displacement(ball, replace(camera, lens=None), BOX, 1.00027, 40)[inner]
-    assert float((smooth - exact).std()) > 3 * float((found[inner] - exact).std())
+    many = replace(camera, lens=replace(camera.lens, points=100))
+    errors = [
+        float((d[inner] - exact).std())
+        for d in (predicted(wide, camera), simulated(many), simulated(replace(camera, lens=None)))
+    ]
+    assert max(errors[:2]) < 0.03 * float(exact.std())
+    assert errors[2] > 3 * errors[0]
 
 
-def test_windows_are_kept_by_files_and_used_by_displacements_alone(wide, tmp_path):
+def test_windows_are_in_files_and_apply_to_displacements_alone(wide, tmp_path):
     cameras = tuple(replace(c, lens=Lens(window=float(i))) for i, c in enumerate(RING.cameras()))
     windowed = replace(wide, cameras=cameras)
     windowed.write(tmp_path / "m.nc")
@@ -88,10 +94,10 @@ def test_windows_are_kept_by_files_and_used_by_displacements_alone(wide, tmp_pat
     dataset = xr.load_dataset(tmp_path / "m.nc")
     assert dataset["window"].attrs["units"] == "px"
     assert "aperture_diameter" not in dataset
-    assert lens_rays(seen_through(back, "auto")) > 1
-    assert lens_rays(seen_through(back, "off")) == 1
+    assert lens_rays(apply_aperture(back, "auto")) > 1
+    assert lens_rays(apply_aperture(back, "off")) == 1
     with refused("aperture"):
-        seen_through(back, "on")
+        apply_aperture(back, "on")
     assert Images.seen_by(cameras[3]).lens.window == 0
     assert wide.techniques[0].seen_by(cameras[3]).lens.window == 3
     dataset["window"][1] = -1.0
@@ -99,13 +105,11 @@ def test_windows_are_kept_by_files_and_used_by_displacements_alone(wide, tmp_pat
         Measurement.from_dataset(dataset)
 
 
-def test_the_focus_is_where_a_lens_sees_like_a_pinhole(wide):
-    """Focused in the middle of the flow the cone is narrow there, and the background is blurred instead."""
+def test_a_lens_focused_on_the_flow_is_like_a_pinhole_there(wide):
+    """The cone is narrow in the flow, and the background is blurred instead."""
     thin = replace(wide.cameras[0], lens=None)
-    pinhole, background, flow = (
-        view_displacement(make_phantom("gaussians", BOX, seed=1), camera, BOX, 1.00027, 20)
-        for camera in (thin, replace(thin, lens=Lens(12.5)), replace(thin, lens=Lens(12.5, RING.distance)))
-    )
+    lenses = (None, Lens(12.5), Lens(12.5, RING.distance))
+    pinhole, background, flow = (simulated(replace(thin, lens=lens), 20) for lens in lenses)
     assert float((flow - pinhole).std()) < 0.5 * float((background - pinhole).std())
 
 
@@ -125,30 +129,27 @@ def test_the_adjoint_of_an_operator_through_lenses(basis, compiled, window, wide
     assert float((operator(x) * y).sum()) == pytest.approx(float((x * operator.T(y)).sum()), rel=1e-9)
 
 
-def test_the_operator_sees_what_the_path_integral_does(wide):
+def test_the_operator_agrees_with_the_path_integral(wide):
     rays, _, _ = wide.rays()
-    grid = Grid.of_resolution(BOX, 40)
-    model = forward_model(wide.techniques[0], wide)
-    operator = VoxelOperator(rays, grid, model, "cubic")
-    field = operator.field(flame().sample(grid))
-    exact = project(PathIntegral(model, 120), field, rays)
-    seen = operator(flame().sample(grid))
-    assert float((seen - exact).std()) < 0.04 * float(exact.std())
+    grid, model = Grid.of_resolution(BOX, 40), forward_model(wide.techniques[0], wide)
+    operator, c = VoxelOperator(rays, grid, model, "cubic"), flame().sample(grid)
+    exact = project(PathIntegral(model, 120), operator.field(c), rays)
+    assert float((operator(c) - exact).std()) < 0.04 * float(exact.std())
     assert rays_through(rays, 1.0) > rays_through(rays, 10.0) >= 2
     assert rays_through(rays, 1e-3) == 16
     assert rays_through(replace(rays, lens=None), 1.0) == 1
     assert operator.for_rays(rays[:10], model).range_shape == (10, 2)
 
 
-def test_the_aperture_can_be_turned_off_and_insisted_on(wide):
-    thin = seen_through(wide, "off")
+def test_the_aperture_can_be_off_or_required(wide):
+    thin = apply_aperture(wide, "off")
     assert all(camera.lens is None for camera in thin.cameras)
-    assert seen_through(wide, "auto") is seen_through(wide, "on") is wide
-    assert seen_through(thin, "off") is thin
+    assert apply_aperture(wide, "auto") is apply_aperture(wide, "on") is wide
+    assert apply_aperture(thin, "off") is thin
     none = replace(wide, cameras=tuple(replace(camera, lens=Lens(0.0)) for camera in wide.cameras))
-    assert all(camera.lens is None for camera in seen_through(none, "auto").cameras)
+    assert all(camera.lens is None for camera in apply_aperture(none, "auto").cameras)
     with refused("aperture"):
-        seen_through(thin, "on")
+        apply_aperture(thin, "on")
     for kind in (NeRIF, Tikhonov):
         with refused("aperture"):
             kind(aperture="f/8")
@@ -158,24 +159,18 @@ def test_the_aperture_can_be_turned_off_and_insisted_on(wide):
         NeRIF(lens_rays=3)
 
 
-def test_a_wider_cone_is_followed_by_more_rays(wide):
-    def of(diameter: float, asked: int = 0) -> int:
-        cameras = tuple(replace(c, lens=Lens(diameter)) for c in wide.cameras)
-        return lens_rays(replace(wide, cameras=cameras), asked)
+def test_a_wider_cone_has_more_rays(wide):
+    def of(diameter: float, count: int = 0) -> int:
+        return lens_rays(replace(wide, cameras=tuple(replace(c, lens=Lens(diameter)) for c in wide.cameras)), count)
 
-    assert lens_rays(seen_through(wide, "off")) == 1
-    assert [of(0.0), of(1.0), of(100.0)] == [1, 2, 12]
+    assert lens_rays(apply_aperture(wide, "off")) == 1
+    assert [of(0.0), of(1.0), of(100.0), of(4.0, 8)] == [1, 2, 12, 8]
     assert 2 <= of(4.0) <= of(8.0) <= of(16.0) <= 12
-    assert of(4.0, 8) == 8
 
 
-def test_lenses_are_known_of_all_views_or_of_none(wide):
-    one = replace(wide.cameras[0], lens=None)
+def test_a_file_keeps_the_lenses_of_all_views(wide, tmp_path):
     with refused("aperture_diameter"):
-        replace(wide, cameras=(one, *wide.cameras[1:]))
-
-
-def test_a_file_keeps_the_lenses(wide, tmp_path):
+        replace(wide, cameras=(replace(wide.cameras[0], lens=None), *wide.cameras[1:]))
     cameras = tuple(replace(c, lens=Lens(float(i), 600.0 if i == 2 else None)) for i, c in enumerate(wide.cameras))
     replace(wide, cameras=cameras).write(tmp_path / "m.nc")
     back = Measurement.read(tmp_path / "m.nc")
@@ -191,7 +186,7 @@ def test_a_file_keeps_the_lenses(wide, tmp_path):
 
 @pytest.mark.parametrize("model", ["lever_arm", "paraxial", "curved"])
 @pytest.mark.parametrize("lens", [Lens(12.5), Lens(window=4.0)], ids=["lens", "window"])
-def test_rays_of_a_pixel_that_miss_the_box_leave_every_term_and_its_slope_finite(wide, lens, model):
+def test_loss_terms_and_gradients_are_finite_if_rays_of_a_pixel_miss_the_box(wide, lens, model):
     cameras = tuple(replace(c, lens=lens) for c in wide.cameras)
     measurement = replace(wide, cameras=cameras, box=Box.cube(20.0))
     shape = NetworkShape(depth=2, width=8, octaves=1, gradient_head=True)
@@ -210,7 +205,7 @@ def test_rays_of_a_pixel_that_miss_the_box_leave_every_term_and_its_slope_finite
 
 
 @pytest.mark.slow
-def test_knowing_the_lens_pays(wide):
+def test_the_lens_reduces_the_error(wide):
     truth = flame().sample(grid := Grid.of_resolution(BOX, 32))
     errors = []
     for aperture in ("auto", "off"):
@@ -219,18 +214,18 @@ def test_knowing_the_lens_pays(wide):
     assert errors[0] < 0.95 * errors[1]
 
 
-def test_a_run_through_lenses_is_repeated_exactly_and_resumed(wide):
+def test_a_run_through_lenses_resumes_exactly(wide):
     settings = NeRIF(max_steps=20, points_per_batch=1024, device="cpu", lens_rays=6)
     points = torch.rand(30, 3, generator=torch.Generator().manual_seed(0)) * 40 - 20
     whole = settings(wide)
     half = settings(wide, on_step=lambda step: step.step == 10)
     assert torch.equal(whole.field(points), settings(wide, resume=half.state).field(points))
     with refused("resume"):
-        settings(seen_through(wide, "off"), resume=half.state)
+        settings(apply_aperture(wide, "off"), resume=half.state)
 
 
 @pytest.mark.slow
-def test_what_is_run_and_asked_on_the_command_line(wide, tmp_path, capsys):
+def test_lenses_on_the_command_line(wide, tmp_path, capsys):
     path, out = tmp_path / "m.nc", tmp_path / "r"
     wide.write(path)
     quick = ["--max-steps", "20", "--network.width", "16", "--voxels", "8", "--no-report"]
@@ -239,7 +234,7 @@ def test_what_is_run_and_asked_on_the_command_line(wide, tmp_path, capsys):
     assert main(["reconstruct", str(path), "-o", str(out), "--aperture", "off", *quick]) == 0
     assert main(["evaluate", str(out), "--measurement", str(path)]) == 0
     field, _, _ = ResultDirectory(out).field()
-    seen = {name: reproject(field, seen_through(wide, name)) for name in ("auto", "off")}
+    seen = {name: reproject(field, apply_aperture(wide, name)) for name in ("auto", "off")}
     scores = {name: evaluate_views(reprojection)[0]["rms"] for name, reprojection in seen.items()}
     assert ResultDirectory(out).metrics()["views"][0]["rms"] == pytest.approx(scores["off"], rel=1e-4)
     assert scores["auto"] != pytest.approx(scores["off"], rel=1e-3)
@@ -250,7 +245,7 @@ def test_what_is_run_and_asked_on_the_command_line(wide, tmp_path, capsys):
     assert [c.lens.diameter for c in Measurement.read(tmp_path / "p.nc").cameras] == pytest.approx([12.5, 12.5])
     assert main(["simulate", "-o", str(tmp_path / "s.nc"), *ring, "--steps", "5", "--truth-voxels", "4"]) == 0
     assert [c.lens.diameter for c in Measurement.read(tmp_path / "s.nc").cameras] == pytest.approx([12.5, 12.5])
-    seen_through(wide, "off").write(tmp_path / "thin.nc")
+    apply_aperture(wide, "off").write(tmp_path / "thin.nc")
     capsys.readouterr()
     assert main(["reconstruct", str(tmp_path / "thin.nc"), "-o", str(tmp_path / "t"), "--aperture", "on", *quick]) == 2
     told = capsys.readouterr().err
@@ -260,9 +255,9 @@ def test_what_is_run_and_asked_on_the_command_line(wide, tmp_path, capsys):
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not RIGS.is_dir(), reason="the measurements of others are not beside the project (shared/data)")
+@pytest.mark.skipif(not RIGS.is_dir(), reason="shared/data is missing")
 @pytest.mark.parametrize("method", [NeRIF(time_limit=45.0, epochs=1e9), TotalVariation(voxels=48)], ids=["nerif", "tv"])
-def test_the_cone_of_a_rig_of_others_is_known(method):
+def test_the_cone_of_a_rig_of_others_reduces_the_error(method):
     measurement, truth = Measurement.read(RIGS / "f4.nc"), read_volume(RIGS / "truth.nc")
     errors = [
         evaluate_volume(replace(method, aperture=aperture)(measurement).field, truth, measurement.n_ambient)["l2"]
@@ -272,12 +267,12 @@ def test_the_cone_of_a_rig_of_others_is_known(method):
 
 
 @pytest.mark.slow
-def test_a_check_goes_by_the_lenses_unless_told_otherwise(wide, tmp_path, capsys):
+def test_a_check_uses_the_lenses_by_default(wide, tmp_path, capsys):
     through = [view.agreement for view in check_consistency(wide, 12).views]
     thin = [view.agreement for view in check_consistency(wide, 12, aperture="off").views]
     assert len(through) == len(thin) == len(wide.names)
     assert through != thin
-    seen_through(wide, "off").write(tmp_path / "thin.nc")
+    apply_aperture(wide, "off").write(tmp_path / "thin.nc")
     for more in ([], ["--refine", "cameras", "--time-limit", "1"]):
         assert main(["check", str(tmp_path / "thin.nc"), "--aperture", "on", *more]) == 2
         assert "aperture: expected a measurement that knows aperture_diameter" in capsys.readouterr().err

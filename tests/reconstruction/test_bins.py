@@ -78,7 +78,7 @@ def test_without_sigma_a_bin_of_more_pixels_has_more_weight(noisy):
     target = Target.of(replace(noisy, sigma=None), edge=EDGE)
     assert target.noise is None
     (part,) = target.parts
-    assert float(part.of_nothing.square().mean()) == pytest.approx(1, rel=1e-5)
+    assert float(part.ambient_residual.square().mean()) == pytest.approx(1, rel=1e-5)
     assert 1.1 < float(part.inverse_scale.max() / part.inverse_scale.min()) <= EDGE
 
 

@@ -1,4 +1,4 @@
-"""Every way through a run on a GPU, without one: tensors are marked as being there, and must not meet others."""
+"""Runs on a GPU, without one: tensors are marked as being there, and must not be combined with others."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:User provided device_type of 'cu
 
 CPU, GPU = torch.device("cpu"), torch.device("cuda:7")
 READ = ("tolist", "item", "__float__", "__int__", "__bool__", "nonzero", "unique")
-"""Functions that wait for what a GPU is at."""
+"""Functions that wait for the GPU."""
 
 
 def place(x: Tensor) -> torch.device:
@@ -30,9 +30,9 @@ def place(x: Tensor) -> torch.device:
 
 
 class PretendedGPU(TorchFunctionMode):
-    """Keeps all numbers on the CPU, marks tensors that are on the GPU, and refuses what torch would refuse there.
+    """Keeps all numbers on the CPU, marks tensors that are on the GPU, and raises where torch would raise there.
 
-    Notes what the CPU waits for, such as copies that are not `non_blocking`, and products of reduced precision.
+    Records for what the CPU waits, such as copies that are not `non_blocking`, and products of reduced precision.
     """
 
     def __init__(self) -> None:
@@ -105,7 +105,7 @@ def gpu(monkeypatch, unchecked) -> PretendedGPU:
     return PretendedGPU()
 
 
-def test_what_rays_see_is_where_the_rays_are(measurement, ball, gpu):
+def test_projections_are_on_the_device_of_the_rays(measurement, ball, gpu):
     rays, _, _ = measurement.rays()
     with gpu:
         seen = project(PathIntegral(LeverArm(1.0003), 4), ball, rays[:9].to(GPU), GPU)
@@ -135,7 +135,7 @@ LONG = ("refined", "voxels")
         *(pytest.param(name, lens, marks=pytest.mark.slow) for name in LONG for lens in (None, Lens(12.0))),
     ],
 )
-def test_no_run_mixes_devices_or_rounds_what_is_no_network(measurement, gpu, name, lens):
+def test_no_run_mixes_devices_or_rounds_outside_the_network(measurement, gpu, name, lens):
     seen = replace(measurement, cameras=tuple(replace(c, lens=lens) for c in measurement.cameras))
     with gpu:
         result = RUNS[name](seen)
@@ -145,7 +145,7 @@ def test_no_run_mixes_devices_or_rounds_what_is_no_network(measurement, gpu, nam
 
 
 @pytest.mark.slow
-def test_a_run_by_images(measurement, gpu):
+def test_a_run_from_images(measurement, gpu):
     draw = torch.Generator().manual_seed(0)
     reference = 100 + 30 * torch.randn(measurement.shape, generator=draw)
     flow = 1.1 * reference + torch.randn(measurement.shape, generator=draw)

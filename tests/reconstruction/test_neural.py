@@ -133,14 +133,14 @@ def test_a_non_finite_loss_rolls_back_and_in_the_end_stops(measurement, monkeypa
         assert "step 10" in result.outcome.message
     else:
         assert result.outcome.reason == "steps"
-        assert sum("taken_back" in record for record in result.history) == 1
+        assert sum("rolled_back" in record for record in result.history) == 1
         assert "rolled back 1 time" in result.outcome.message
 
 
 @pytest.mark.slow
 def test_a_learning_rate_far_too_high_is_lowered(measurement):
     result = replace(SMALL, learning_rate=0.5, max_steps=80)(measurement)
-    assert any("taken_back" in record for record in result.history)
+    assert any("rolled_back" in record for record in result.history)
     assert not result.outcome.failed
     assert result.history[-1]["loss"] < 0.5
 
@@ -157,7 +157,7 @@ def test_a_collapsed_field_is_rolled_back(measurement, monkeypatch):
         steps.append(step.step)
 
     result = run.run(sabotage)
-    assert sum("taken_back" in record for record in result.history) == 1
+    assert sum("rolled_back" in record for record in result.history) == 1
     assert result.history[-1]["loss"] < 0.1
     assert result.outcome.reason == "steps"
 

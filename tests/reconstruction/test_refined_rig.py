@@ -19,7 +19,7 @@ from nerif.fields.base import Field
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Ring
 from nerif.geometry.pose import GEOMETRY, Corrections
-from nerif.reconstruction.rig.parameters import NAMES, UNCONSTRAINED, moved_lines, with_corrections
+from nerif.reconstruction.rig.parameters import NAMES, UNCONSTRAINED, refinement_lines, with_corrections
 from nerif.reconstruction.rig.posterior import with_posterior
 from nerif.reconstruction.rig.refinement import Refinement, refit
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
@@ -109,12 +109,12 @@ def test_unconstrained_poses_are_reported(measured, case):
         noise = sigma * torch.randn(sigma.shape, generator=torch.Generator().manual_seed(1))
         rows = posterior(replace(measured, displacement=measured.displacement + noise, sigma=sigma), BALLS)
     assert max(row["constrained"] for row in rows) < UNCONSTRAINED
-    assert "do not constrain the pose of any view" in moved_lines(rows)[1]
+    assert "do not constrain the pose of any view" in refinement_lines(rows)[1]
 
 
 def test_corrections_of_three_views_are_reported_as_uncertain():
     three = simulated(BALLS, replace(RING, views=3, arc=(0.0, 120.0)))
-    assert any(line.startswith("with 3 views the field can") for line in moved_lines(posterior(three, BALLS)))
+    assert any(line.startswith("with 3 views the field can") for line in refinement_lines(posterior(three, BALLS)))
 
 
 def test_a_withheld_view_is_refined_against_the_field(measured):

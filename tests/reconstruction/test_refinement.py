@@ -22,7 +22,7 @@ from nerif.geometry.pose import GEOMETRY, Corrections
 from nerif.imaging.calibration.cameras_file import read_cameras
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.neural.training_data import TrainingData
-from nerif.reconstruction.rig.parameters import NAMES, displaced, moved_lines, with_corrections
+from nerif.reconstruction.rig.parameters import NAMES, displaced, refinement_lines, with_corrections
 from nerif.reconstruction.rig.refinement import Refinement
 from nerif.reconstruction.target import Target
 from nerif.simulation.simulate import simulate
@@ -153,7 +153,7 @@ def test_nothing_moves_before_the_data_show_a_pose_error(measured, wrong):
     again = Refinement.for_measurement(measured, ["cameras", "shift"])
     again.load_state_dict(moved.state_dict())
     assert again.off
-    (line,) = moved_lines(right.table())
+    (line,) = refinement_lines(right.table())
     assert "cameras unchanged" in line
 
 
@@ -279,7 +279,7 @@ def test_priors_are_given_or_of_the_camera_or_the_default(measured, view, mm, si
 def test_significant_corrections_are_reported():
     near = {"name": "a", "moved": 0.5, "values": {"shift_x": 0.1}, "sigma": {"shift_x": 0.2}}
     far = {"name": "b", "moved": 5.0, "values": {"shift_x": 1.0}, "sigma": {"shift_x": 0.2}}
-    first, line = moved_lines([near, far, near, near])
+    first, line = refinement_lines([near, far, near, near])
     assert "b, 5.0 sigma" in first
     assert line.startswith("view b is not where its calibration says: shift_x 1 mm, 5.0 sigma")
 

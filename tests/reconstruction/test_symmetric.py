@@ -18,7 +18,7 @@ from nerif.forward.registry import forward_models
 from nerif.geometry import Box, Grid, Lens, paper_rig
 from nerif.geometry.symmetry import Symmetry
 from nerif.reconstruction.neural.neural import NeRIF
-from nerif.reconstruction.symmetry import check_views, find_axis, symmetry_asked
+from nerif.reconstruction.symmetry import check_views, find_axis, symmetry_of
 from nerif.reconstruction.voxels.landweber import Landweber
 from nerif.reconstruction.voxels.layout import Symmetric
 from nerif.reconstruction.voxels.multiplicative import MLEM
@@ -82,7 +82,7 @@ def test_the_operator_is_the_path_integral_of_its_field_and_has_its_adjoint(jet,
 def test_one_view_is_enough(jet, method, most):
     result = replace(method, symmetry="axis")(one_view(jet))
     assert error(result, jet.box) < most
-    assert result.axis.told == (True, False, True, False)
+    assert result.axis.constrained == (True, False, True, False)
 
 
 @pytest.mark.slow
@@ -113,7 +113,7 @@ def test_one_view_determines_the_axis_in_the_image_plane_only(jet, shift):
     beside = across - across[2] / lean[2] * lean  # where it crosses z = 0
     assert abs(float(beside @ e1)) < 0.05
     assert abs(float(lean @ torch.linalg.cross(look, torch.tensor([0.0, 0.0, 1.0]).double()))) < 0.003
-    assert one.told == (True, False, True, False)
+    assert one.constrained == (True, False, True, False)
     assert one.sigma_after[1] == one.sigma[1]
 
 
@@ -122,7 +122,7 @@ def test_two_views_determine_the_axis():
     cameras, box = paper_rig(40)
     measured = simulate(make_phantom("gaussian-jet", box, 0), [cameras[0], cameras[4]], box, 1.00027, 0.03, 0)
     axis = find_axis(measured, Symmetry.about("axis", (1.0, -0.7, 0.0), (0.03, -0.02, 1.0), 0.1), (2.0, 0.05), SIDES)
-    assert all(axis.told)
+    assert all(axis.constrained)
     x, y, z = axis.symmetry.point
     along = axis.symmetry.direction
     assert math.hypot(x - z * along[0] / along[2], y - z * along[1] / along[2]) < 0.1
@@ -131,7 +131,7 @@ def test_two_views_determine_the_axis():
 
 def test_the_axis_can_be_fixed(jet):
     fixed = Tikhonov(voxels=16, symmetry="axis", axis_sigma_mm=0.0, axis_sigma_deg=0.0)
-    assert fixed(one_view(jet)).axis.symmetry == symmetry_asked(fixed, one_view(jet))
+    assert fixed(one_view(jet)).axis.symmetry == symmetry_of(fixed, one_view(jet))
 
 
 class Bent(Field):

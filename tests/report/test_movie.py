@@ -19,7 +19,7 @@ from nerif.data.volume import Volume
 from nerif.data.volume_sequence import VolumeSequence, add_frames
 from nerif.fields.phantoms import Flame
 from nerif.geometry import Box, Grid
-from nerif.report.movie import Movie, _points, _surfaces, frames_there, instants
+from nerif.report.movie import Movie, _points, _surfaces, finished_frames, instants
 from refusals import refused
 
 SMALL = ["--quantity", "index_excess", "--size", "240", "180"]
@@ -70,14 +70,14 @@ def test_masked_voxels_are_grey_and_have_no_isosurface(store):
 
 
 def test_only_finished_frames_are_drawn(store, tmp_path):
-    assert frames_there(store) == [0, 1, 2]
+    assert finished_frames(store) == [0, 1, 2]
     partial = VolumeSequence.create(tmp_path / "v.zarr", store.times, store.grid, ("index_excess",), 1.00027)
     add_frames(partial.group, "status", 3, (), (), "int8", 0)
     partial.write(1, [store.volume(1, "index_excess")])
     with refused(partial.path):
-        Movie(quantity="index_excess").write(tmp_path / "m.mp4", partial, frames_there(partial))
+        Movie(quantity="index_excess").write(tmp_path / "m.mp4", partial, finished_frames(partial))
     partial.array("status")[1] = 1
-    assert frames_there(partial) == [1]
+    assert finished_frames(partial) == [1]
 
 
 def test_times_of_frames_differ():

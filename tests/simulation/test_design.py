@@ -60,7 +60,7 @@ def test_lengths_of_a_telecentric_lens_are_those_of_its_magnification():
 @pytest.mark.parametrize("ring", [RING, PARALLEL], ids=lambda r: r.projection)
 def test_the_cone_is_the_one_that_is_rendered(ring):
     camera = ring.cameras()[0]
-    middle = camera.stopped_down(ring.pixel_pitch, SETTINGS.f_number).rays(torch.tensor([[99.5, 79.5]]).double())
+    middle = camera.with_f_number(ring.pixel_pitch, SETTINGS.f_number).rays(torch.tensor([[99.5, 79.5]]).double())
     rim = torch.tensor([[[1.0, 0.0, 0.0, 0.0]]], dtype=torch.float64)
     edges = [middle.through(offset) for offset in (rim, -rim)]
     assert torch.allclose(edges[0].end_points, edges[1].end_points, atol=1e-9)  # in focus on the background

@@ -124,7 +124,7 @@ def test_where_a_telecentric_lens_is_along_its_axis_changes_no_image(ball):
     texture = background_texture(far, torch.from_numpy(0.5 + 0.15 * noise / noise.std()), 1.0)
     strong, images, diameters = Scaled(ball, 30.0), [], []
     for camera in (far, near):
-        camera = camera.stopped_down(0.12, 4.0)
+        camera = camera.with_f_number(0.12, 4.0)
         camera = dataclasses.replace(camera, lens=dataclasses.replace(camera.lens, points=5))
         diameters.append(camera.lens.diameter)
         still = render(camera, texture, samples=1)

@@ -9,7 +9,7 @@ from torch import Tensor
 from nerif.common.conventions import Points, Values, Vectors
 from nerif.data.volume import Volume
 from nerif.fields.base import Field, in_chunks
-from nerif.geometry.pose import turned
+from nerif.geometry.pose import rotation_matrix
 
 __all__ = ["MovedField", "aligned"]
 
@@ -31,7 +31,7 @@ class MovedField(Field):
         self.field, self.turn, self.shift = field, turn, shift
 
     def value_and_gradient(self, points: Points) -> tuple[Values, Vectors]:
-        rotation = turned(self.turn.double()).to(points)
+        rotation = rotation_matrix(self.turn.double()).to(points)
         value, gradient = self.field.value_and_gradient(points @ rotation.T + self.shift.to(points))
         return value, gradient @ rotation
 
@@ -53,7 +53,7 @@ def aligned(field: Field, truth: Volume) -> MovedField:
     for _ in range(MAX_ITERATIONS):
         parts = [result.value_and_gradient(chunk) for chunk in in_chunks(points)]
         value, gradient = (torch.cat(part).double() for part in zip(*parts, strict=True))
-        rotation = turned(result.turn)
+        rotation = rotation_matrix(result.turn)
         position, gradient = points.double() @ rotation.T, gradient @ rotation.T
         jacobian = torch.cat([torch.linalg.cross(position, gradient) * (1 / reach), gradient], dim=1)
         step = torch.linalg.lstsq(jacobian, (target - value)[:, None]).solution[:, 0]

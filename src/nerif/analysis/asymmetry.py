@@ -125,7 +125,7 @@ def withhold_half(
         raise InputError(
             f"expected half an image ('{names[0]}') with --symmetry axis only; name views", field="withhold"
         )
-    symmetry = axis if isinstance(axis, Symmetry) else Symmetry.kept(axis["symmetry"])
+    symmetry = axis if isinstance(axis, Symmetry) else Symmetry.from_entries(axis["symmetry"])
     halves = halved(measurement, symmetry)
     return halves, tuple(name for name in halves.names if name.endswith(f" {names[0]}"))
 

@@ -33,7 +33,7 @@ from nerif.forward.path_integral import PathIntegral
 from nerif.forward.registry import forward_model
 from nerif.geometry import Camera, Grid
 from nerif.geometry.plausibility import rig_findings, suspects
-from nerif.reconstruction.aperture import seen_through
+from nerif.reconstruction.aperture import apply_aperture
 from nerif.reconstruction.device import on_free_cores
 from nerif.reconstruction.gauge import ambient_faces
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
@@ -122,7 +122,7 @@ def check_consistency(
     on_step : called with the numbers of finished and of all reconstructions of this round
     aperture : depth of field, as in NeRIF
     """
-    measurement = seen_through(measurement, aperture)
+    measurement = apply_aperture(measurement, aperture)
     observations = integrals_of(measurement)
     rig = rig_findings(measurement.cameras, measurement.box)
     past_box = {name for finding in rig if finding.code == "beside" for name in finding.views}

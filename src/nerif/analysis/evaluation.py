@@ -29,7 +29,7 @@ from nerif.fields.grid import VoxelField
 from nerif.forward.registry import AUTO, forward_model
 from nerif.geometry import Box
 from nerif.plotting.notebook import number
-from nerif.reconstruction.aperture import seen_through
+from nerif.reconstruction.aperture import apply_aperture
 from nerif.reconstruction.rig.parameters import with_corrections
 from nerif.results.directory import METRICS, VOLUME, ResultDirectory
 
@@ -38,7 +38,7 @@ ALIGNMENTS = ("none", "rigid")
 PARALLEL_PIXELS = 8e6  # of the views that are scored at a time: about 0.1 GiB per megapixel
 
 __all__ = [
-    "FLOW", "check_inside", "evaluate", "evaluate_aligned", "evaluate_views", "evaluate_volume", "rms_text",
+    "FLOW", "check_inside", "evaluate", "evaluate_aligned", "evaluate_views", "evaluate_volume", "rms_with_unit",
     "score_lines",
 ]  # fmt: skip
 
@@ -96,7 +96,7 @@ def evaluate(
             raise InputError(f"expected views of {', '.join(data.names)}, got '{unknown[0]}'", field="withhold")
         withheld = tuple(name for name in names if name in data.names)
         aperture = "off" if settings.get("aperture", "off") == "off" else "auto"
-        data = with_gains(seen_through(data, aperture), gains_of(settings))
+        data = with_gains(apply_aperture(data, aperture), gains_of(settings))
         data = with_corrections(data, stored.get("rig", []))
         views = reproject(field, data, withheld, on_view=on_view, model=str(settings.get("model", AUTO)))
         metrics |= {"views": evaluate_views(views), "reprojection": [a.entries for a in views.accuracies]}
@@ -162,7 +162,7 @@ def _rms(values: Tensor) -> float:
     return float(values.square().mean().sqrt())  # NaN of no pixels
 
 
-def rms_text(view: dict[str, Any], digits: int = 4) -> str:
+def rms_with_unit(view: dict[str, Any], digits: int = 4) -> str:
     """Return the rms error of a view with its unit."""
     return with_unit(number(view.get("rms"), digits), view["unit"])
 
@@ -175,7 +175,7 @@ def score_lines(views: list[dict[str, Any]]) -> list[str]:
         group = [v for v in views if v["withheld"] is withheld and v["measured"] == name]
         if group:
             cc = min(v["cc"] for v in group)
-            rms = rms_text(max(group, key=lambda v: v["rms"]))
+            rms = rms_with_unit(max(group, key=lambda v: v["rms"]))
             noise = max(v.get("rms_over_sigma", float("nan")) for v in group)
             in_sigma = "" if noise != noise else f", at most {noise:.2f} sigma"
             head = f"{len(group)} {role} view{'s' * (len(group) > 1)}{f', {name}' if len(measured) > 1 else ''}"

@@ -9,11 +9,11 @@ from typing import Any
 from nerif.common.findings import Finding
 from nerif.data.measurement import Measurement
 from nerif.geometry.plausibility import rig_findings
-from nerif.reconstruction.aperture import seen_through
+from nerif.reconstruction.aperture import apply_aperture
 from nerif.reconstruction.device import on_free_cores
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.progress import QUIET, Monitor
-from nerif.reconstruction.rig.parameters import MOVED, moved_lines
+from nerif.reconstruction.rig.parameters import MOVED, refinement_lines
 from nerif.reconstruction.rig.posterior import with_posterior
 from nerif.reconstruction.shared_settings import Aperture
 from nerif.reconstruction.sources import of_source
@@ -63,8 +63,8 @@ def check_rig(
     with monitor.training("refining the rig") as on_step:
         result = settings(data, on_step)
     with monitor.counting("accuracy of the rig") as bar:
-        table = with_posterior(result.rig, seen_through(data, aperture), result.field, result.settings, bar)
-    lines = moved_lines(table)
+        table = with_posterior(result.rig, apply_aperture(data, aperture), result.field, result.settings, bar)
+    lines = refinement_lines(table)
     moved = [row["name"] for row in table if row["moved"] > MOVED]
     first = len(lines) - len(moved)
     remarks = lines[:first]

@@ -1,4 +1,4 @@
-"""A box in three dimensions with surfaces in it, to be turned with the mouse."""
+"""A box with surfaces in it, in 3D, turned with the mouse."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from nerif.geometry import Box
 
 __all__ = ["BoxScene"]
 
-SIZE = 4.0  # of the longest edge of the box in the scene
+SIZE = 4.0  # longest edge of the box, in scene units
 GROUND = "#eef1f4"
 EDGE = "#76838f"
 
 
 class BoxScene:
-    """A scene, where the page is being built.
+    """A 3D scene, added to the page under construction.
 
     Parameters
     ----------
     box : mm
-    label : for those who do not see it
+    label : description for screen readers
     size : width and height, px
     """
 
@@ -35,18 +35,18 @@ class BoxScene:
         self._edges()
 
     def name(self, label: str) -> None:
-        """Say what is seen."""
+        """Describe the scene for screen readers."""
         if self.scene.props.get("aria-label") != label:
             self.scene.props["aria-label"] = label
             self.scene.update()
 
     def clear(self) -> None:
-        """Leave the box alone."""
+        """Remove all surfaces; the box stays."""
         self.scene.clear()
         self._edges()
 
     def add(self, address: str, colour: str, opacity: float = 1.0) -> Any:
-        """Put in a surface, an STL file in mm, and return it: `delete` takes it out."""
+        """Add a surface, an STL file in mm, and return it; its `delete` removes it."""
         with self.scene:
             surface = self.scene.stl(address).material(colour, opacity, side="both").scale(self._scale)
             return surface.move(*(-c * self._scale for c in self.box.centre))

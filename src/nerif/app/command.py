@@ -1,4 +1,4 @@
-"""nerif app: the whole road in a browser, on this machine."""
+"""nerif app: all steps from design to results in a browser."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ __all__ = ["App", "main", "run"]
 class App(Settings):
     """Work on a folder in the browser: design, images, calibration, reconstruction, results.
 
-    Whatever is done there is a command line, which is shown; runs go on when page and server are closed.
+    Each step shows its command line; runs continue when page and server are closed.
     """
 
     folder: Annotated[Path, tyro.conf.Positional] = Path(".")
-    """Folder of the project; nothing outside of it is read or written."""
+    """Folder of the project; files outside it are neither read nor written."""
     port: int = 8620
-    """Port to listen on; the next free one if it is taken."""
+    """Port to listen on; if it is in use, the next free one."""
     host: str = "127.0.0.1"
-    """Address to listen on. Any other than this machine's own needs --token: whoever reaches it and knows the token can
-    run nerif here and read and write the folder, and what goes to and fro is not encrypted."""
+    """Address to listen on. Any other than this machine's own needs --token: everyone with access and the token can run
+    nerif here and read and write the folder. The connection is not encrypted."""
     token: str | None = None
-    """Token in the address, of 16 letters or more; else a random one each time. Other users of the machine can read the
-    command line: give it in a --config file that they cannot read."""
+    """Token in the address, 16 characters or more; without it a new random one at each start. Other users of this
+    machine can read the command line: set the token in a --config file that they cannot read."""
     browser: bool = True
     """Open the browser."""
 
@@ -47,7 +47,7 @@ class App(Settings):
 
 
 def run(settings: App) -> None:
-    """Serve until Ctrl-C."""
+    """Start the server; Ctrl-C ends it."""
     if importlib.util.find_spec("nicegui") is None:
         raise InputError(f"expected NiceGUI, which is not installed; {install('app')}", field="app")
     from nerif.app.server import Address, serve
@@ -56,5 +56,5 @@ def run(settings: App) -> None:
 
 
 def main(arguments: list[str]) -> None:
-    """Parse and run."""
+    """Parse the arguments and start the server."""
     run(read_settings(App(), arguments, "app"))

@@ -1,4 +1,4 @@
-"""The part of its frames that is a view's own: drawn with the mouse or typed, turned and flipped, each step undone."""
+"""Editor of a view's crop: drawn with the mouse or typed, with rotation and flip."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["CropEditor"]
 
 FLIPS = {"": "None", "horizontal": "Left and right", "vertical": "Top and bottom", "both": "Both"}
 TURNS = {0: "0°", 90: "90° left", 180: "180°", 270: "90° right"}
-LEAST = 4  # px along an edge of what is drawn with the mouse: less is a slip of the hand
+LEAST = 4  # px along an edge drawn with the mouse: less is a slip of the hand
 NUMBERS = {"column": "Left", "row": "Top", "width": "Width", "height": "Height"}
 DRAG = """(event) => { const me = event.currentTarget, r = me.getBoundingClientRect(), mark = me.querySelector('.mark');
 const at = (e) => [Math.min(Math.max((e.clientX - r.left) / r.width, 0), 1),
@@ -32,23 +32,23 @@ me.addEventListener('pointermove', move); me.addEventListener('pointerup', end, 
 
 
 class CropEditor:
-    """Controls of one view's crop, where the page is being built.
+    """Controls of one view's crop, added to the page under construction.
 
     Parameters
     ----------
-    name : of the view
-    shape : height and width of its frames, px
-    crop : to begin with
-    address : of the whole frame
-    changed : told the new crop
+    name : name of the view
+    shape : (height, width) of its frames, px
+    crop : initial crop
+    address : address of the image of the whole frame
+    on_change : called with the new crop
     """
 
     def __init__(
-        self, name: str, shape: tuple[int, int], crop: Crop, address: str, changed: Callable[[Crop], Awaitable[None]]
+        self, name: str, shape: tuple[int, int], crop: Crop, address: str, on_change: Callable[[Crop], Awaitable[None]]
     ) -> None:
-        self.shape, self.crop, self._changed = shape, crop, changed
+        self.shape, self.crop, self._on_change = shape, crop, on_change
         height, width = shape
-        with ui.element("div").classes("cropper").on("pointerdown", self._drawn, js_handler=DRAG) as place:
+        with ui.element("div").classes("cropper").on("pointerdown", self._on_drag, js_handler=DRAG) as place:
             place.style(f"aspect-ratio: {width / height:.4f}; --aspect: {width / height:.4f}")
             image = ui.element("img").props("draggable=false")
             image.props["src"], image.props["alt"] = address, f"Whole frame of {name}"
@@ -65,31 +65,31 @@ class CropEditor:
         control = ui.number(text, value=0, min=low, step=1, suffix="px").props("outlined dense debounce=250")
         control.props(f'name="{key}" aria-label="{text} (px)"')
 
-        async def typed() -> None:
+        async def update() -> None:
             value = control.value
-            if value is None or int(value) == self._shown(key):
+            if value is None or int(value) == self._value(key):
                 return
             await self._put(**{key: int(value)})
 
-        return control.on_value_change(typed)
+        return control.on_value_change(update)
 
     def _choice(self, label: str, options: dict[Any, str], key: str) -> ui.select:
         control = ui.select(options, label=label, value=getattr(self.crop, key)).props("outlined dense options-dense")
         control.props["aria-label"] = label
 
-        async def chosen() -> None:
+        async def update() -> None:
             if control.value != getattr(self.crop, key):
                 await self._put(**{key: control.value})
 
-        return control.on_value_change(chosen)
+        return control.on_value_change(update)
 
-    def _shown(self, key: str) -> int:
-        """A number as it is typed: a width of 0 reaches to the edge."""
+    def _value(self, key: str) -> int:
+        """Return the value of a number control: a crop size of 0 reaches to the edge."""
         value = int(getattr(self.crop, key))
         whole = {"width": self.shape[1] - self.crop.column, "height": self.shape[0] - self.crop.row}
         return value or whole.get(key, 0)
 
-    async def _drawn(self, event: Any) -> None:
+    async def _on_drag(self, event: Any) -> None:
         height, width = self.shape
         left, top, right, bottom = event.args
         column, row = round(left * width), round(top * height)
@@ -100,19 +100,19 @@ class CropEditor:
         await self._put(row=row, column=column, **size)
 
     async def _put(self, **values: Any) -> None:
-        """Take a change if it can be right."""
-        said: list[str] = []
-        with refusals(said.append):
+        """Change the crop if it is valid, or show the error."""
+        errors: list[str] = []
+        with refusals(errors.append):
             crop = replace(self.crop, **values)
             crop.shape_of(self.shape)
             self.crop = crop
         self._error.set_content("")
-        if said:
-            text = said[0].removeprefix("crop: ")
+        if errors:
+            text = errors[0].removeprefix("crop: ")
             self._error.set_content(f"<span role=alert>{escape(text[:1].upper() + text[1:])}</span>")
             return
         self._show()
-        await self._changed(self.crop)
+        await self._on_change(self.crop)
 
     def put(self, crop: Crop) -> None:
         """Show another crop."""
@@ -122,12 +122,12 @@ class CropEditor:
 
     def _show(self) -> None:
         for key, control in self._numbers.items():
-            control.set_value(self._shown(key))
+            control.set_value(self._value(key))
         self._flip.set_value(self.crop.flip)
         self._rotate.set_value(self.crop.rotate)
         height, width = self.shape
         self._mark.style(
             replace=f"left: {100 * self.crop.column / width:.3f}%; top: {100 * self.crop.row / height:.3f}%; "
-            f"width: {100 * self._shown('width') / width:.3f}%; height: {100 * self._shown('height') / height:.3f}%"
+            f"width: {100 * self._value('width') / width:.3f}%; height: {100 * self._value('height') / height:.3f}%"
         )
         self._mark.update()

@@ -1,4 +1,4 @@
-"""Crops of views as they are edited: each step can be undone, and all is kept as it is typed, before it is written."""
+"""Unsaved changes of crops, with undo and redo."""
 
 from __future__ import annotations
 
@@ -10,34 +10,34 @@ from nerif.imaging.readers.crop import Crop
 
 __all__ = ["CropEdits"]
 
-STEPS = 100  # that can be undone
+STEPS = 100  # of undo
 
 
 class CropEdits:
-    """The crops of an experiment's views, with what was before and what was undone.
+    """The crops of an experiment's views, with the steps to undo and to redo.
 
     Parameters
     ----------
-    written : crops as they are in the folder
-    kept : of `kept` of an earlier one
+    written : crops in the folder
+    draft : `draft` of earlier edits
     """
 
-    def __init__(self, written: Mapping[str, Crop], kept: Mapping[str, Any] | None = None) -> None:
+    def __init__(self, written: Mapping[str, Crop], draft: Mapping[str, Any] | None = None) -> None:
         self.written = dict(written)
-        kept = kept or {}
-        self.now = {**self.written, **{k: c for k, c in _crops(kept.get("now", {})).items() if k in self.written}}
-        self.past = [(n, Crop(**c)) for n, c in kept.get("past", []) if n in self.written]
-        self.future = [(n, Crop(**c)) for n, c in kept.get("future", []) if n in self.written]
+        draft = draft or {}
+        self.now = {**self.written, **{k: c for k, c in _crops(draft.get("now", {})).items() if k in self.written}}
+        self.past = [(n, Crop(**c)) for n, c in draft.get("past", []) if n in self.written]
+        self.future = [(n, Crop(**c)) for n, c in draft.get("future", []) if n in self.written]
 
     @property
-    def kept(self) -> dict[str, Any]:
-        """What can be kept as JSON."""
+    def draft(self) -> dict[str, Any]:
+        """The edits as JSON, to be restored after a reload."""
         steps = {name: [[n, asdict(c)] for n, c in getattr(self, name)] for name in ("past", "future")}
         return {"now": {name: asdict(crop) for name, crop in self.changed.items()}, **steps}
 
     @property
     def changed(self) -> dict[str, Crop]:
-        """Crops that are not as in the folder."""
+        """Crops that differ from those in the folder."""
         return {name: crop for name, crop in self.now.items() if crop != self.written[name]}
 
     def put(self, name: str, crop: Crop) -> None:
@@ -49,18 +49,18 @@ class CropEdits:
         self.now[name] = crop
 
     def undo(self) -> str:
-        """Take the last step back; returns the view whose it was, nothing if there is none."""
+        """Undo the last step and return its view, empty if there is none."""
         return self._step(self.past, self.future)
 
     def redo(self) -> str:
-        """Take the last step that was undone again."""
+        """Repeat the last step that was undone."""
         return self._step(self.future, self.past)
 
-    def _step(self, come_from: list[tuple[str, Crop]], go_to: list[tuple[str, Crop]]) -> str:
-        if not come_from:
+    def _step(self, source: list[tuple[str, Crop]], target: list[tuple[str, Crop]]) -> str:
+        if not source:
             return ""
-        name, crop = come_from.pop()
-        go_to.append((name, self.now[name]))
+        name, crop = source.pop()
+        target.append((name, self.now[name]))
         self.now[name] = crop
         return name
 

@@ -1,4 +1,4 @@
-"""A choice among files of the project, which looks anew whenever it is opened."""
+"""A selection of one of the project's files, read from disk each time it is opened."""
 
 from __future__ import annotations
 
@@ -10,39 +10,39 @@ __all__ = ["FileChoice"]
 
 
 class FileChoice:
-    """A select, where the page is being built.
+    """A select control, added to the page under construction.
 
     Parameters
     ----------
-    label : for people
-    names : of the files that are there
-    value : of them, to begin with; another one, or none, is the first
-    look : looks for the names as they are now
-    turned : done when another one is chosen
+    label : label of the control
+    names : names of the files
+    value : initial name; one that is not among the names selects the first
+    look : returns the current names
+    on_change : called when another file is selected
     """
 
     def __init__(
         self, label: str, names: Sequence[str], value: object, look: Callable[[], Awaitable[Sequence[str]]],
-        turned: Callable[[], Awaitable[None] | None],
+        on_change: Callable[[], Awaitable[None] | None],
     ) -> None:  # fmt: skip
         first = str(value) if value in names else next(iter(names), None)
         self.select = ui.select(list(names), label=label, value=first)
         self.select.props("outlined dense options-dense").props["aria-label"] = label
         self._look = look
         self.select.on("popup-show", self.look)
-        self.select.on_value_change(turned)
+        self.select.on_value_change(on_change)
 
     @property
     def name(self) -> str:
-        """The file that is chosen; empty if there is none."""
+        """The selected file; empty if there is none."""
         return str(self.select.value or "")
 
     async def look(self) -> None:
-        """See which files there are now."""
+        """Update the names from disk."""
         self._take(await self._look(), self.name)
 
     async def choose(self, name: str) -> None:
-        """Choose a file that has just been written, if it is there."""
+        """Select a file that has just been written, if it exists."""
         names = await self._look()
         self._take(names, name if name in names else self.name)
 

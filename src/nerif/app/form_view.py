@@ -1,4 +1,4 @@
-"""A form on a page: a control for each setting, with what it means below and what is wrong with it beside."""
+"""A form on a page: a control for each setting, with its help and its error."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ T = TypeVar("T")
 
 
 class FormView(Generic[T]):
-    """Controls of a form, in the part of the page that is being built.
+    """Controls of a form, added to the page under construction.
 
     Parameters
     ----------
-    form : Form
-    on_change : called after each change, whether the values can be right or not
-    values : to begin with
-    main : names of the fields that are seen at once; the others are behind "More settings"; all if empty
-    sliders : lowest and highest value, by name, of fields that have a slider beside the number
+    form : fields and record of the settings
+    on_change : called after each change, also to invalid values
+    values : initial values by field; defaults for the others
+    main : names of the fields at the top; the others are under "More settings". Empty: all
+    sliders : lowest and highest value by name, for fields with a slider beside the number
     """
 
     def __init__(
@@ -40,7 +40,7 @@ class FormView(Generic[T]):
         self.values: dict[str, Any] = dict(values or {})
         self.errors: dict[str, str] = {}
         self._controls: dict[str, Any] = {}
-        self._said: dict[str, ui.html] = {}
+        self._messages: dict[str, ui.html] = {}
         names = [f.name for f in form.fields]
         for name in main or names:
             self._control(form.field(name))
@@ -49,39 +49,39 @@ class FormView(Generic[T]):
             self._more(rest)
         self.check()
 
-    # -- what it holds -------------------------------------------------------------------------------------------
+    # -- values --------------------------------------------------------------------------------------------------
 
     @property
     def arguments(self) -> list[str]:
-        """Arguments of nerif that do what the form says."""
+        """Arguments of nerif for the values of the form."""
         return self.form.arguments(self.values)
 
     @property
-    def right(self) -> bool:
-        """Whether nothing is wrong."""
+    def valid(self) -> bool:
+        """Whether all values are valid."""
         return not self.errors
 
-    def made(self) -> T:
-        """The record; InputError if something is wrong."""
-        return self.form.made(self.values)
+    def record(self) -> T:
+        """Return the record; InputError if a value is invalid."""
+        return self.form.build(self.values)
 
     def set(self, name: str, value: Any) -> None:
-        """Set a value as if it were typed."""
+        """Set a value as by its control."""
         if name in self._controls:
-            self._controls[name].set_value(_shown(self.form.field(name), value))
+            self._controls[name].set_value(_control_value(self.form.field(name), value))
         else:
             self._changed(self.form.field(name), value)
 
     def check(self) -> None:
-        """Say beside each field what is wrong with it."""
+        """Show the error of each field."""
         self.errors = self.form.errors(self.values)
-        for name, said in self._said.items():
+        for name, message in self._messages.items():
             error = self.errors.get(name, "")
-            said.set_content(f"<span role=alert>{escape(error)}</span>" if error else "")
+            message.set_content(f"<span role=alert>{escape(error)}</span>" if error else "")
             self._controls[name].props(f"aria-invalid={'true' if error else 'false'}")
             self._controls[name].classes(**{"add" if error else "remove": "wrong"})
 
-    # -- how it is made ------------------------------------------------------------------------------------------
+    # -- controls ------------------------------------------------------------------------------------------------
 
     def _more(self, names: Sequence[str]) -> None:
         with ui.expansion("More settings", icon="tune").classes("more") as more:
@@ -99,42 +99,42 @@ class FormView(Generic[T]):
     def _control(self, field: FormField) -> None:
         value = self.values.get(field.name, field.default)
         with ui.element("div").classes("field"):
-            control = self._made(field, _shown(field, value))
+            control = self._control_of(field, _control_value(field, value))
             label = f"{field.label}{f' ({field.unit})' if field.unit else ''}"
             control.props(f'name="{field.name}" aria-label="{escape(label)}"')
-            control.on_value_change(lambda event: self._changed(field, _meant(field, event.value)))
+            control.on_value_change(lambda event: self._changed(field, _record_value(field, event.value)))
             self._controls[field.name] = control
             if field.name in self.sliders:
                 self._slider(field, control, f"{label}, slider")
-            self._said[field.name] = ui.html("", sanitize=False).classes("error")
+            self._messages[field.name] = ui.html("", sanitize=False).classes("error")
             if field.help:
                 ui.html(f"<p>{escape(field.help)}</p>", sanitize=False).classes("help")
 
     def _slider(self, field: FormField, control: Any, label: str) -> None:
-        """The browser's own slider: keys and screen readers know it."""
+        """Add a slider of the browser, which has keys and screen reader support."""
         scale = Scale(*self.sliders[field.name], whole=field.kind == "integer")
         slider = ui.element("input").classes("range")
         slider.props(f'type=range min=0 max={scale.last} step=1 aria-label="{escape(label)}"')
-        by_hand: list[float] = []
+        position: list[float] = []
 
-        def moved(event: Any) -> None:
-            by_hand[:] = [scale.value(int(event.args))]
-            control.set_value(by_hand[0])
+        def move(event: Any) -> None:
+            position[:] = [scale.value(int(event.args))]
+            control.set_value(position[0])
 
         def follow() -> None:
             value = control.value
             if not isinstance(value, int | float):
                 return
             slider.props(f'aria-valuetext="{value:g} {escape(field.unit)}"')
-            if [value] != by_hand:  # one that is being moved is where it should be
+            if [value] != position:  # not while the slider is moved
                 slider.props(f"value={scale.step(value)}")
 
-        slider.on("input", moved, throttle=0.05, js_handler="(event) => emit(event.target.value)")
+        slider.on("input", move, throttle=0.05, js_handler="(event) => emit(event.target.value)")
         control.on_value_change(follow)
         follow()
 
-    def _made(self, field: FormField, value: Any) -> Any:
-        """The control itself, by the kind of the field."""
+    def _control_of(self, field: FormField, value: Any) -> Any:
+        """Return the control for the kind of the field."""
         label = field.label
         if field.kind == "switch":
             return ui.switch(label, value=bool(value))
@@ -154,15 +154,15 @@ class FormView(Generic[T]):
         self.on_change()
 
 
-def _shown(field: FormField, value: Any) -> Any:
-    """A value as its control has it."""
+def _control_value(field: FormField, value: Any) -> Any:
+    """Return the value of a field in the form of its control."""
     if field.kind == "words":
         return " ".join(f"{v:g}" if isinstance(v, float) else str(v) for v in value or ())
     return ("" if value is None else str(value)) if field.kind == "text" else value
 
 
-def _meant(field: FormField, value: Any) -> Any:
-    """A value as the record has it, or as near as what is typed comes to it: the record says what is wrong."""
+def _record_value(field: FormField, value: Any) -> Any:
+    """Return the value of a control in the type of the record, which rejects invalid input."""
     if field.kind == "integer" and isinstance(value, float) and value.is_integer():
         return int(value)
     if field.kind == "number" and isinstance(value, int):
@@ -176,7 +176,7 @@ def _meant(field: FormField, value: Any) -> Any:
 
 
 def _number(word: str, field: FormField) -> Any:
-    """A number where the default has numbers, else the word."""
+    """Return a number where the default has numbers, else the word."""
     numeric = not field.default or all(isinstance(v, int | float) for v in field.default)
     if not numeric:
         return word

@@ -1,6 +1,6 @@
-"""Forms made from the records of settings: their fields, texts, defaults, choices; and the command line that they give.
+"""Forms from the settings records: fields, help texts, defaults, choices and the command line.
 
-Nothing is checked here: values are put into the record, which refuses what cannot be right and names the field.
+The record checks the values and names the invalid field.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ __all__ = ["Form", "FormField"]
 T = TypeVar("T")
 
 UNITS = ("mm", "px", "nm", "K", "Pa", "degrees", "s", "seconds", "mrad", "Hz", "GB")
-LEFT_OUT = ("config",)
+HIDDEN = ("config",)
 MISSING = (tyro.MISSING,)
 
 
@@ -35,13 +35,13 @@ class FormField:
 
     Parameters
     ----------
-    name : as flags have it, with underscores; network.width for a field of the record `network`
-    kind : switch, integer, number, choice, words (several, with spaces between), or text
-    help : what the record says of it
-    unit : of a number; empty if it has none
-    default : value if nothing is asked for
-    choices : words to choose from; empty if any text may stand there
-    optional : whether it may be left without a value
+    name : name of the flag, with underscores; network.width for a field of the record `network`
+    kind : switch, integer, number, choice, words (separated by spaces) or text
+    help : documentation of the field in the record
+    unit : unit of a number; empty if it has none
+    default : default value
+    choices : valid words; empty for free text
+    optional : whether the value may be None
     """
 
     name: str
@@ -54,16 +54,16 @@ class FormField:
 
     @property
     def label(self) -> str:
-        """Its name for people."""
+        """The label of its control."""
         return self.name.replace("_", " ").replace(".", ": ").capitalize()
 
     @property
     def flag(self) -> str:
-        """Its name on the command line."""
+        """The flag on the command line."""
         return "--" + self.name.replace("_", "-")
 
     def words(self, value: Any) -> list[str]:
-        """Return what gives it that value on the command line."""
+        """Return the arguments that set the value on the command line."""
         if self.kind == "switch":
             group, dot, last = self.flag[2:].rpartition(".")
             return [self.flag if value else f"--{group}{dot}no-{last}"]
@@ -72,15 +72,15 @@ class FormField:
 
 
 class Form(Generic[T]):
-    """The settings of a verb, or of a part of it.
+    """The settings of a command, or some of them.
 
     Parameters
     ----------
-    record : with the defaults; tyro.MISSING where there is none
-    verb : of the command line, with what always stands there
-    only : names of the fields that are shown; all if empty
-    without : names of fields that are not
-    choices : of fields whose record does not tell them
+    record : settings with the defaults; tyro.MISSING where there is none
+    verb : first arguments of the command line
+    only : names of the fields to show; empty: all
+    without : names of the fields to hide
+    choices : valid words of fields that the record does not limit
     """
 
     def __init__(
@@ -88,77 +88,65 @@ class Form(Generic[T]):
         record: T,
         verb: Sequence[str] = (),
         only: Sequence[str] = (),
-        without: Collection[str] = LEFT_OUT,
+        without: Collection[str] = HIDDEN,
         choices: Mapping[str, Sequence[str]] | None = None,
     ) -> None:
         self.record, self.verb = record, tuple(verb)
-        found = {f.name: f for f in _fields(record, choices or {})}
-        if unknown := [name for name in only if name not in found]:
-            raise InputError(f"expected some of {', '.join(found)}, got {', '.join(unknown)}", field="only")
-        kept = [found[name] for name in only] if only else list(found.values())
-        self.fields = tuple(f for f in kept if f.name not in without)
+        fields = {f.name: f for f in _fields(record, choices or {})}
+        if others := [name for name in only if name not in fields]:
+            raise InputError(f"expected some of {', '.join(fields)}, got {', '.join(others)}", field="only")
+        self.fields = tuple(fields[name] for name in only or fields if name not in without)
 
     def field(self, name: str) -> FormField:
-        """Return one field."""
+        """Return a field by its name."""
         return next(f for f in self.fields if f.name == name)
 
     def changed(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the values that are others than the defaults; those of fields that are not shown are left out."""
-        defaults = {f.name: f for f in self.fields}
+        """Return the values of shown fields that differ from their defaults."""
+        defaults = {f.name: f.default for f in self.fields}
         return {
-            name: value for name, value in values.items()
-            if name in defaults and not _same(value, defaults[name].default)
+            name: value for name, value in values.items() if name in defaults and not _same(value, defaults[name])
         }  # fmt: skip
 
-    def made(self, values: Mapping[str, Any]) -> T:
-        """Return the record with the values put in.
-
-        Raises
-        ------
-        InputError
-            If a value is of the wrong type, or cannot be right.
-        """
+    def build(self, values: Mapping[str, Any]) -> T:
+        """Return the record with the values; InputError if one is invalid."""
         return merge(self.record, _nested(self.changed(values)), "here")
 
     def errors(self, values: Mapping[str, Any]) -> dict[str, str]:
-        """Return what is wrong, by the name of the field; under "" what is wrong of several."""
-        found: dict[str, str] = {}
+        """Return the errors by field; an error of several fields together is under ""."""
+        errors: dict[str, str] = {}
         changed = self.changed(values)
         for name, value in changed.items():
             try:
                 merge(self.record, _nested({name: value}), "here")
             except InputError as error:
-                found[name] = _said(str(error), name)
-        rest = {name: value for name, value in changed.items() if name not in found}
+                errors[name] = _short(error, name)
+        rest = {name: value for name, value in changed.items() if name not in errors}
         try:
             merge(self.record, _nested(rest), "here")
         except InputError as error:
-            named = str(error).partition(":")[0].strip()
-            where = next((f.name for f in self.fields if f.name.rpartition(".")[2] == named), "")
-            found[where] = _said(str(error), where)
-        # a setting that is right only beside another one is no fault of either
-        for name in [name for name in found if name and self._right(values, name)]:
-            del found[name]
-        return found
+            where = next((f.name for f in self.fields if f.name.rpartition(".")[2] == error.field), "")
+            errors[where] = _short(error, where)
+        # a value may be valid only together with another one
+        return {name: error for name, error in errors.items() if not name or not self._valid(values)}
 
-    def _right(self, values: Mapping[str, Any], name: str) -> bool:
-        """Whether all together are accepted."""
+    def _valid(self, values: Mapping[str, Any]) -> bool:
         try:
-            self.made(values)
+            self.build(values)
         except InputError:
             return False
         return True
 
     def arguments(self, values: Mapping[str, Any]) -> list[str]:
-        """Return the arguments of nerif: the verb, and the flags of what is not as by default."""
+        """Return the arguments of nerif: the verb, and the flags of values other than the defaults."""
         changed = self.changed(values)
         words = [word for f in self.fields if f.name in changed for word in f.words(changed[f.name])]
         return [*self.verb, *words]
 
 
 def _fields(record: Any, choices: Mapping[str, Sequence[str]], prefix: str = "") -> list[FormField]:
-    """The fields of a record, those of records among its fields in their place."""
-    cls, found = type(record), []
+    """Return the fields of a record; those of nested records are in the place of the record."""
+    cls, fields = type(record), []
     for name, where in flat_names(cls).items():
         holder = getattr(record, where[0]) if len(where) == 2 else record
         hint = typing.get_type_hints(type(holder), include_extras=True)[name]
@@ -168,7 +156,7 @@ def _fields(record: Any, choices: Mapping[str, Sequence[str]], prefix: str = "")
             hint = hint.__origin__
         value = getattr(holder, name)
         if dataclasses.is_dataclass(value):
-            found += _fields(value, choices, f"{prefix}{name}.")
+            fields += _fields(value, choices, f"{prefix}{name}.")
             continue
         default = None if value in MISSING else value
         text = help_of(type(holder), name)
@@ -177,12 +165,12 @@ def _fields(record: Any, choices: Mapping[str, Sequence[str]], prefix: str = "")
         kind = "choice" if words else kind
         numbers = kind in ("integer", "number") or (kind == "words" and "str" not in str(hint))
         unit = _unit(text) if numbers else ""
-        found.append(FormField(prefix + name, kind, text, unit, default, words, optional))
-    return found
+        fields.append(FormField(prefix + name, kind, text, unit, default, words, optional))
+    return fields
 
 
 def _kind(hint: Any) -> tuple[str, bool]:
-    """How a field is asked for, and whether it may be None."""
+    """Return the kind of control for a type, and whether None is valid."""
     options = typing.get_args(hint) if typing.get_origin(hint) in (types.UnionType, typing.Union) else (hint,)
     optional = type(None) in options
     hint = next(o for o in options if o is not type(None))
@@ -194,10 +182,10 @@ def _kind(hint: Any) -> tuple[str, bool]:
 
 
 def choices_of(record: Any, name: str) -> tuple[str, ...]:
-    """Return the words that a record lets a field be, by what it says of another one; empty if it takes any."""
+    """Return the valid words of a field, from the error message of the record; empty for free text."""
     try:
         return _choices(record, name)
-    except TypeError:  # a record that cannot be hashed
+    except TypeError:  # the record has no hash
         return ()
 
 
@@ -221,7 +209,7 @@ def _accepts(record: Any, name: str, word: str) -> bool:
 
 
 def _unit(text: str) -> str:
-    """The unit that a help text ends its first clause with."""
+    """Return the unit at the end of a clause of the help text."""
     for clause in re.split(r"[;.]\s|[.;]$", text):
         for part in re.split(r", | \(", clause):
             if (word := (part.strip(" ).").split() or [""])[-1]) in UNITS:
@@ -243,7 +231,7 @@ def _same(value: Any, default: Any) -> bool:
 
 
 def _nested(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Values as a settings file has them: those of network.width in a table `network`."""
+    """Return values in the layout of a settings file: network.width in the table `network`."""
     table: dict[str, Any] = {}
     for name, value in values.items():
         *groups, last = name.split(".")
@@ -254,8 +242,8 @@ def _nested(values: Mapping[str, Any]) -> dict[str, Any]:
     return table
 
 
-def _said(message: str, name: str) -> str:
-    """The message beside its field, which need not be named again."""
-    message = re.sub(r"^here(?: \[\w+\])?: ", "", message)
+def _short(error: InputError, name: str) -> str:
+    """Return the message for a place beside the field, without the field name."""
+    message = re.sub(r"^here(?: \[\w+\])?: ", "", str(error))
     short = re.sub(rf"^'?{re.escape(name.rpartition('.')[2])}'?(?: = [^:]*)?: ", "", message)
     return short[:1].upper() + short[1:]

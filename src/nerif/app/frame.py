@@ -1,4 +1,4 @@
-"""The frame of every page: header with the project, the way through the work on the left, the runs on the right."""
+"""The frame of every page: header with the project, links to the pages on the left, runs on the right."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ ASSETS = Path(__file__).parent / "assets"
 
 @dataclass(frozen=True)
 class Frame:
-    """What a page is given beside its main part."""
+    """Parts of the frame that a page uses."""
 
     drawer: JobsDrawer
 
@@ -37,7 +37,7 @@ def _style() -> str:
 
 @contextmanager
 def frame(work: Workspace, page: Page, pages: Sequence[Page]) -> Iterator[Frame]:
-    """Build the frame around a page; what is made within stands in its main part."""
+    """Build the frame of a page; controls created in the context go into its main part."""
     ui.add_css(_style())
     ui.page_title(f"{page.title} – {work.project.name} – nerif")
     dark = ui.dark_mode(None)
@@ -68,7 +68,7 @@ def frame(work: Workspace, page: Page, pages: Sequence[Page]) -> Iterator[Frame]
 
 
 def _switch(dark: ui.dark_mode) -> None:
-    """Light, dark, or as the system has it."""
+    """Add the menu for light or dark colours."""
     names = {None: "As the system", False: "Light", True: "Dark"}
     icons = {None: "brightness_auto", False: "light_mode", True: "dark_mode"}
     with ui.button(icon=icons[None]).props('flat round aria-label="Light or dark"') as button, ui.menu():

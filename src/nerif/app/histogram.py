@@ -10,13 +10,13 @@ WIDTH, HEIGHT = 320, 64
 
 
 def histogram(shares: Sequence[float], full: float, label: str) -> str:
-    """Return the drawing; full scale is at its right end.
+    """Return the histogram as HTML; full scale is at the right end.
 
     Parameters
     ----------
-    shares : of the pixels, by bin from 0 to full scale
-    full : grey value of a full sensor
-    label : for those who do not see it, made safe already
+    shares : fraction of the pixels per bin, from 0 to full scale
+    full : grey value at full scale
+    label : description for screen readers, escaped
     """
     most = max(shares) or 1.0
     step = WIDTH / len(shares)

@@ -30,7 +30,7 @@ class ImageFiles:
 
     def __init__(self, project: Project) -> None:
         self.project = project
-        self._kept: OrderedDict[tuple[Any, ...], Any] = OrderedDict()  # what was asked for last at its end
+        self._kept: OrderedDict[tuple[Any, ...], Any] = OrderedDict()  # least recently used first
         self._lock = Lock()  # of what is kept: pages ask in threads
 
     def stamp(self, view: View, source: str) -> tuple[Any, ...]:
@@ -40,8 +40,10 @@ class ImageFiles:
         where = path if path.exists() else path.parent
         if not where.resolve().is_relative_to(self.project.folder):
             raise InputError(f"expected images in {self.project.folder}, got some outside of it", field=name)
-        found = [os.stat(where), *(entry.stat() for entry in os.scandir(where))] if where.is_dir() else [os.stat(where)]
-        return len(found), max(f.st_mtime_ns for f in found), sum(f.st_size for f in found)
+        result = (
+            [os.stat(where), *(entry.stat() for entry in os.scandir(where))] if where.is_dir() else [os.stat(where)]
+        )
+        return len(result), max(f.st_mtime_ns for f in result), sum(f.st_size for f in result)
 
     def look(self, view: View, source: str, most: int) -> ImageQuality:
         """Return how the images of a source are; InputError where there are none of use."""
@@ -57,8 +59,8 @@ class ImageFiles:
 
         return self._once(view, source, ("image", number, largest, crop, white), read)
 
-    def found(self, view: View, source: str, number: int, target: CalibrationTarget) -> Detection | None:
-        """Return what is found of a target in an image; None if it is not found."""
+    def result(self, view: View, source: str, number: int, target: CalibrationTarget) -> Detection | None:
+        """Return the corners of a target in an image; None if it is not detected."""
 
         def read() -> Detection | None:
             frames = view.open(source)
@@ -70,12 +72,12 @@ class ImageFiles:
         key = str(Path(view.folder)), view.name, view.sources.get(source), source, view.crop, what
         stamp = self.stamp(view, source) if source in view.sources else ()
         with self._lock:
-            kept = self._kept.get(key)
-        if kept is None or kept[0] != stamp:
-            kept = (stamp, read())
+            memory = self._kept.get(key)
+        if memory is None or memory[0] != stamp:
+            memory = (stamp, read())
         with self._lock:
-            self._kept[key] = kept
+            self._kept[key] = memory
             self._kept.move_to_end(key)
             while len(self._kept) > MOST:
                 self._kept.popitem(last=False)
-        return kept[1]
+        return memory[1]

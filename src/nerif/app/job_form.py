@@ -1,4 +1,4 @@
-"""A form whose settings become a run of nerif: its command line, a button that queues it, and how the run goes."""
+"""A form for a run of nerif: settings, command line, a button that queues the run, and its status."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from nicegui import ui
 
 from nerif.app.form_view import FormView
 from nerif.app.forms import Form
-from nerif.app.job_told import LINES, JobTold
+from nerif.app.job_status import LINES, JobStatus
 from nerif.app.pieces import CommandLine, refusals
 from nerif.app.workspace import Workspace
 
@@ -17,21 +17,21 @@ __all__ = ["JobForm"]
 
 
 class JobForm:
-    """A form, its command line and a button, where the page is being built.
+    """A form, its command line, a button and the status, added to the page under construction.
 
     Parameters
     ----------
-    work : Workspace
-    name : under which what is typed is kept over a reload
-    form : settings, all but those that `words` gives
-    words : the verb, and what stands before the settings of the form
-    button : what it says
-    main : names of the fields that are seen at once
-    out : what is written, relative to the project; its folder is made
-    first : done before the run is put into the queue, which it is not where this raises InputError
-    about : what the run that goes on is about, by which it is kept over a reload
-    offer : done by a button that goes on with what the run has written; None for no button
-    lines : of what the run has said, that are shown when it has ended well
+    work : workspace of the project
+    name : key of the draft that restores the values after a reload
+    form : settings without those in `words`
+    words : returns the verb and the arguments before the settings of the form
+    button : label of the button
+    main : names of the fields at the top of the form
+    out : returns the output, relative to the project; its folder is created
+    first : called before the run is queued; an InputError prevents the run
+    about : subject of the run, part of the key that restores its status after a reload
+    offer : called by a button that continues with the output; None for no button
+    lines : number of log lines shown after success
     """
 
     def __init__(
@@ -44,19 +44,19 @@ class JobForm:
         self.view = FormView(form, self._changed, work.draft(name), main)
         self.command = CommandLine()
         self.button = ui.button(button, icon="playlist_add", on_click=self._start).props("unelevated no-caps")
-        self.told = JobTold(work, f"{name}.run {about}".strip(), offer=offer, lines=lines)
+        self.status = JobStatus(work, f"{name}.run {about}".strip(), offer=offer, lines=lines)
         self.show()
 
     @property
     def arguments(self) -> list[str]:
-        """Arguments of nerif."""
+        """Arguments of nerif for the run."""
         return [*self.words(), *self.view.arguments]
 
     def show(self) -> None:
-        """Show the command line as it is now."""
+        """Update the command line and the button."""
         if hasattr(self, "command"):
             self.command.show(self.arguments)
-            self.button.set_enabled(self.view.right)
+            self.button.set_enabled(self.view.valid)
 
     def _changed(self) -> None:
         self.work.keep(self.name, self.view.form.changed(self.view.values))
@@ -64,10 +64,10 @@ class JobForm:
 
     async def _start(self) -> None:
         with refusals():
-            self.view.made()
+            self.view.record()
             if self.first is not None:
                 await self.first()
             if self.out is not None:
                 self.work.project.path(self.out()).parent.mkdir(parents=True, exist_ok=True)
             words = self.arguments
-            self.told.follow(self.work.jobs.add(words, f"{words[0].capitalize()} {words[1]}"))
+            self.status.follow(self.work.jobs.add(words, f"{words[0].capitalize()} {words[1]}"))

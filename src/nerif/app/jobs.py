@@ -1,17 +1,17 @@
-"""Runs of `nerif ...`, one after the other: a queue on disk, which a server that is started again finds as it was.
+"""Queue of runs of `nerif ...` on disk, which survives a restart of the server.
 
-Each run has a folder of its own in FOLDER/.nerif/jobs with job.json (what is asked), log.txt, and what its process
-writes down: started.json and ended.json (runner.py). State is nowhere else. The name of an empty file says whose the
-run is: `waiting`, and once a server has started a process for it, runner-PID-TIME of that process. Renaming it is the
-claim, which one server alone can make. Where that process has gone before the run began, the run waits again.
+Each run has a folder in FOLDER/.nerif/jobs with job.json (the request), log.txt, and started.json and ended.json of its
+process (runner.py); there is no other state. The name of an empty file is the owner of the run: `waiting`, and once a
+server has started a process for it, runner-PID-TIME of that process. A server claims a run by renaming this file, which
+only one server can do. If the process disappears before the run starts, the run is queued again.
 
-A folder may come from somebody else, runs in it among them. job.json is signed with a secret of the user (private.py);
-what is not, or was changed, or was signed for another folder, is refused: it is shown, and never started.
+A folder may come from another user and contain runs. job.json is signed with a secret of the user (private.py); a run
+without signature, with changes, or signed for another folder, is refused: listed, but never started.
 
     queued ─▶ running ─▶ done | failed | stopped
                  │
-                 └─▶ paused ─▶ queued ...          stopped, and gone on with: nerif reconstruct by --resume, nerif
-                                                  sequence by the same line, which does what is missing
+                 └─▶ paused ─▶ queued ...          stopped, then continued: nerif reconstruct by --resume, nerif
+                                                  sequence by the same command, which adds the missing frames
 """
 
 from __future__ import annotations
@@ -44,19 +44,19 @@ from nerif.results.directory import RUN
 __all__ = ["REFUSED", "Job", "Jobs", "command_line"]
 
 WAITING, OWNER = "waiting", "runner-"
-CLOCK = 1.5  # seconds by which two readings of when a process was started may differ
-MOST = 64  # runs at the same time
+CLOCK = 1.5  # tolerance of the start time of a process, s
+MOST = 64  # simultaneous runs
 RESUMABLE = ("reconstruct", "sequence")
 OVER = ("done", "failed", "stopped", "refused")
 REFUSED = (
-    "You did not put it into the queue of this folder, or it was changed, or the folder was moved. It is not started; "
+    "This run was not queued by you in this folder, or it was changed, or the folder was moved. It is not started; "
     "start the run again from its page."
 )
-"""What is said of a run without a valid signature."""
+"""Message of a run without a valid signature."""
 
 
 def command_line(arguments: Sequence[str]) -> str:
-    """Return the line that does the same in a shell, in the folder of the project."""
+    """Return the command line for a shell in the folder of the project."""
     return shlex.join(["nerif", *arguments])
 
 
@@ -67,16 +67,16 @@ class Job:
     Parameters
     ----------
     id : name of its folder; sorts by time
-    title : what it is, for people
-    arguments : of nerif, the verb first
-    attempt : those of the present start: of a run that is gone on with, other ones
-    out : what it writes, relative to the folder; empty if that is no result directory
-    asked : "", "stop" or "pause"
-    place : in the queue
+    title : title for display
+    arguments : arguments of nerif, the verb first
+    attempt : arguments of the present start; after a pause these differ, e.g. by --resume
+    out : result directory relative to the folder; empty if the run writes none
+    request : "", "stop" or "pause"
+    place : sort key in the queue
     state : queued, running, paused, done, failed, stopped or refused
-    pid : of its process while it runs
-    code : exit code once it has ended
-    started, ended : seconds since the epoch, 0 if not yet
+    pid : process id while it runs
+    code : exit code after the end
+    started, ended : seconds since the epoch, 0 before
     """
 
     id: str
@@ -84,7 +84,7 @@ class Job:
     arguments: tuple[str, ...]
     attempt: tuple[str, ...]
     out: str = ""
-    asked: str = ""
+    request: str = ""
     place: float = 0.0
     state: str = "queued"
     pid: int = 0
@@ -94,22 +94,22 @@ class Job:
 
     @property
     def line(self) -> str:
-        """The command line of its present start."""
+        """The command line of the present start."""
         return command_line(self.attempt)
 
     @property
     def file(self) -> str:
-        """The file that its line says it writes; empty if it names none."""
+        """The output file in its arguments; empty if there is none."""
         return next((b for a, b in pairwise(self.arguments) if a in ("-o", "--out")), "")
 
     @property
     def resumable(self) -> bool:
-        """Whether it can be paused: stopped, and gone on with later."""
+        """Whether it can be paused: stopped and continued later."""
         return self.arguments[0] in RESUMABLE and bool(self.out) and self.state != "refused"
 
 
-KEPT: dict[str, type | tuple[type, ...]] = {
-    "id": str, "title": str, "arguments": list, "attempt": list, "out": str, "asked": str, "place": (int, float),
+ENTRIES: dict[str, type | tuple[type, ...]] = {
+    "id": str, "title": str, "arguments": list, "attempt": list, "out": str, "request": str, "place": (int, float),
 }  # fmt: skip
 SIGNATURE = "signature"
 
@@ -119,43 +119,32 @@ class Jobs:
 
     Parameters
     ----------
-    folder : of the project
-
-    Raises
-    ------
-    InputError
-        If there is no secret to sign with (private.py).
+    folder : folder of the project
     """
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.directory = folder, folder / OWN / "jobs"
         self._secret = secret()
 
-    # -- what there is -------------------------------------------------------------------------------------------
+    # -- state ---------------------------------------------------------------------------------------------------
 
     def all(self) -> list[Job]:
-        """Return all runs: what waits and runs in the order of the queue, then what has ended, the last one first."""
-        found = [job for job in map(self._read, self._names()) if job is not None]
-        open_, over = ("running", "queued", "paused"), [j for j in found if j.state in OVER]
-        return sorted((j for j in found if j.state in open_), key=lambda j: (open_.index(j.state), j.place)) + sorted(
+        """Return all runs: open ones in the order of the queue, then ended ones, latest first."""
+        jobs = [job for job in map(self._read, self._names()) if job is not None]
+        open_, over = ("running", "queued", "paused"), [j for j in jobs if j.state in OVER]
+        return sorted((j for j in jobs if j.state in open_), key=lambda j: (open_.index(j.state), j.place)) + sorted(
             over, key=lambda j: j.ended, reverse=True
         )
 
     def get(self, id: str) -> Job:
-        """Return one run.
-
-        Raises
-        ------
-        InputError
-            If there is none of that name.
-        """
+        """Return one run; InputError if there is none with this id."""
         job = self._read(id) if id in self._names() else None
         if job is None:
             raise InputError(f"expected one of {', '.join(self._names()) or 'none'}, got '{id}'", field="job")
         return job
 
     def log(self, id: str, lines: int = 200) -> list[str]:
-        """Return the last lines that a run has printed."""
+        """Return the last lines of the log of a run."""
         path = self._of(self.get(id)) / LOG
         if not path.is_file():
             return []
@@ -172,79 +161,67 @@ class Jobs:
         return self.directory / job.id
 
     def _read(self, name: str) -> Job | None:
-        """A run and its state; None where its folder is damaged or just being removed."""
+        """Return a run and its state; None if its folder is damaged or being removed."""
         where = self.directory / name
-        found = _json(where / JOB)
-        kept, signature = {k: v for k, v in found.items() if k in KEPT}, found.get(SIGNATURE)
-        if not _is_job(kept):
+        content = _json(where / JOB)
+        entries, signature = {k: v for k, v in content.items() if k in ENTRIES}, content.get(SIGNATURE)
+        if not _is_job(entries):
             return None
-        job = Job(**{**kept, "arguments": tuple(kept["arguments"]), "attempt": tuple(kept["attempt"])})
-        if job.id != name or not hmac.compare_digest(str(signature).encode(), self._signature(kept).encode()):
+        job = Job(**{**entries, "arguments": tuple(entries["arguments"]), "attempt": tuple(entries["attempt"])})
+        if job.id != name or not hmac.compare_digest(str(signature).encode(), self._signature(entries).encode()):
             return replace(job, id=name, state="refused", ended=(where / JOB).stat().st_mtime)
-        owned = _owned(_owner(where))  # before the others are read: how a run ended is written just before its end
+        alive = _owner_alive(_owner(where))  # before ended.json is read, which is written just before the process ends
         started, ended = _json(where / STARTED), _json(where / ENDED)
         if ended:
             job = replace(job, code=int(ended["code"]), started=started.get("time", 0.0), ended=ended["time"])
-            over = {"pause": "paused", "stop": "stopped"}.get(job.asked, "done")
-            if job.code and job.arguments[0] != "sequence":  # which ends by Ctrl-C in no other way
+            over = {"pause": "paused", "stop": "stopped"}.get(job.request, "done")
+            if job.code and job.arguments[0] != "sequence":  # nerif sequence always ends with a code after Ctrl-C
                 over = "stopped"
-            return replace(job, state=over if job.asked or not job.code else "failed")
+            return replace(job, state=over if job.request or not job.code else "failed")
         if started:
             job = replace(job, started=started["time"], pid=int(started["pid"]))
-            if owned or _alive(job.pid, started["began"]):
+            if alive or _alive(job.pid, started["began"]):
                 return replace(job, state="running")
-            return replace(job, state="stopped" if job.asked else "failed", ended=(where / STARTED).stat().st_mtime)
-        if job.asked:
+            return replace(job, state="stopped" if job.request else "failed", ended=(where / STARTED).stat().st_mtime)
+        if job.request:
             return replace(job, state="stopped")
-        return replace(job, state="running" if owned else "queued")
+        return replace(job, state="running" if alive else "queued")
 
-    # -- what is asked -------------------------------------------------------------------------------------------
+    # -- requests ------------------------------------------------------------------------------------------------
 
     def add(self, arguments: Sequence[str], title: str, out: str = "") -> Job:
         """Put a run at the end of the queue.
 
         Parameters
         ----------
-        arguments : of nerif, the verb first; paths relative to the folder of the project
-        title : for people
-        out : result directory that it writes, relative to the folder
+        arguments : arguments of nerif, the verb first; paths relative to the folder of the project
+        title : title for display
+        out : result directory, relative to the folder
         """
         if not arguments:
-            raise InputError("expected a verb of nerif, got nothing", field="arguments")
+            raise InputError("expected a command of nerif, got nothing", field="arguments")
         name = f"{time.strftime('%Y%m%d-%H%M%S')}-{secrets.token_hex(3)}"
         words = tuple(str(word) for word in arguments)
         job = Job(name, title, words, words, str(out), place=time.time())
         self._of(job).mkdir(parents=True)
         (self._of(job) / WAITING).touch()
-        self._keep(job)
+        self._write(job)
         return job
 
     def stop(self, id: str) -> None:
-        """Ask a run to end, with what it has; asked twice, it breaks off. One that waits does not begin."""
-        self._ask(id, "stop")
+        """Stop a run and keep its present result; a second call aborts it, and a queued run never starts."""
+        self._request(id, "stop")
 
     def pause(self, id: str) -> None:
-        """Ask a run to end, to be gone on with later.
-
-        Raises
-        ------
-        InputError
-            If it cannot be gone on with.
-        """
+        """Stop a run that can be continued later; InputError for others."""
         if not self.get(id).resumable:
             raise InputError(
                 f"only nerif {' and '.join(RESUMABLE)} can be paused; stop it and start it again", field=f"job {id}"
             )
-        self._ask(id, "pause")
+        self._request(id, "pause")
 
     def resume(self, id: str) -> None:
-        """Put a run that has been paused, stopped or broken off back into the queue: from its checkpoint, if it can.
-
-        Raises
-        ------
-        InputError
-            If it is refused.
-        """
+        """Queue an ended run again, from its checkpoint if there is one; InputError if it is refused."""
         job = self.get(id)
         if job.state in ("queued", "running"):
             return
@@ -253,21 +230,21 @@ class Jobs:
             attempt = tuple(word for word in attempt if word != "--force")
         elif job.resumable and (self.folder / job.out / RUN).is_file():
             attempt = (job.arguments[0], "--resume", "--out", job.out, *(("--live",) if "--live" in attempt else ()))
-        self._keep(replace(job, attempt=attempt, asked="", place=time.time()))
-        for name in (STARTED, ENDED):  # it waits once the last of them is gone
+        self._write(replace(job, attempt=attempt, request="", place=time.time()))
+        for name in (STARTED, ENDED):  # the run is queued once both are removed
             (self._of(job) / name).unlink(missing_ok=True)
 
     def first(self, id: str) -> None:
-        """Let a waiting run be the next."""
+        """Move a queued run to the front."""
         job = self.get(id)
-        self._keep(replace(job, place=min((j.place for j in self.all()), default=0.0) - 1))
+        self._write(replace(job, place=min((j.place for j in self.all()), default=0.0) - 1))
 
     def earlier(self, id: str) -> None:
-        """Let a waiting run change places with the one before it."""
+        """Swap a queued run with the one before it."""
         self._swap(id, -1)
 
     def later(self, id: str) -> None:
-        """Let a waiting run change places with the one after it."""
+        """Swap a queued run with the one after it."""
         self._swap(id, 1)
 
     def _swap(self, id: str, by: int) -> None:
@@ -276,25 +253,19 @@ class Jobs:
         if at is None or not 0 <= at + by < len(waiting):
             return
         job, other = waiting[at], waiting[at + by]
-        self._keep(replace(job, place=other.place))
-        self._keep(replace(other, place=job.place))
+        self._write(replace(job, place=other.place))
+        self._write(replace(other, place=job.place))
 
     def remove(self, id: str) -> None:
-        """Forget a run that has ended or waits; what it wrote stays.
-
-        Raises
-        ------
-        InputError
-            If it runs.
-        """
+        """Remove a run from the list, not its output; InputError while it runs."""
         job = self.get(id)
         if job.state == "running":
-            raise InputError("it runs; stop it first", field=f"job {id}")
+            raise InputError("the run is in progress; stop it first", field=f"job {id}")
         shutil.rmtree(self._of(job))
 
     @property
     def at_once(self) -> int:
-        """How many run at the same time."""
+        """Number of simultaneous runs."""
         count = _json(self.directory / "settings.json").get("at_once")
         return count if isinstance(count, int) and 1 <= count <= MOST else 1
 
@@ -305,30 +276,30 @@ class Jobs:
         self.directory.mkdir(parents=True, exist_ok=True)
         write_json(self.directory / "settings.json", {"at_once": int(count)})
 
-    def _ask(self, id: str, what: str) -> None:
+    def _request(self, id: str, request: str) -> None:
         job = self.get(id)
         if job.state not in ("queued", "running", "paused"):
             return
-        self._keep(replace(job, asked=what))
-        now = self._read(id)  # it may have begun meanwhile; one that begins later looks at what is asked
+        self._write(replace(job, request=request))
+        now = self._read(id)  # it may have started meanwhile; one that starts later reads the request
         if job.state == "running" and now is not None and now.state == "running" and now.pid:
             os.kill(now.pid, signal.SIGINT)
 
-    def _keep(self, job: Job) -> None:
+    def _write(self, job: Job) -> None:
         if job.state == "refused":
             raise InputError(str(REFUSED), field=f"job {job.id}")
-        kept = {name: value for name, value in asdict(job).items() if name in KEPT}
-        write_json(self._of(job) / JOB, {**kept, SIGNATURE: self._signature(kept)})
+        entries = {name: value for name, value in asdict(job).items() if name in ENTRIES}
+        write_json(self._of(job) / JOB, {**entries, SIGNATURE: self._signature(entries)})
 
-    def _signature(self, kept: Mapping[str, Any]) -> str:
-        """What only this user can write of a run in this folder."""
-        words = json.dumps([str(self.folder), kept], sort_keys=True)
+    def _signature(self, entries: Mapping[str, Any]) -> str:
+        """Return the signature of a run of this user in this folder."""
+        words = json.dumps([str(self.folder), entries], sort_keys=True)
         return hmac.new(self._secret, words.encode(), "sha256").hexdigest()
 
     # -- the queue -----------------------------------------------------------------------------------------------
 
     def advance(self) -> None:
-        """Start as many of the waiting runs as may run at the same time."""
+        """Start queued runs up to the number of simultaneous runs."""
         jobs = self.all()
         free = self.at_once - sum(job.state == "running" for job in jobs)
         for job in [job for job in jobs if job.state == "queued"][: max(free, 0)]:
@@ -336,50 +307,50 @@ class Jobs:
 
     def _launch(self, job: Job) -> None:
         where = self._of(job)
-        with (where / LOG).open("ab") as log:  # what the runner prints is why it could not start the run
+        with (where / LOG).open("ab") as log:  # the runner prints why it could not start the run
             runner = subprocess.Popen(
                 [sys.executable, "-P", "-m", "nerif.app.runner", str(where)], stdin=subprocess.PIPE,
                 stdout=subprocess.DEVNULL, stderr=log, start_new_session=True,
             )  # fmt: skip
         assert runner.stdin is not None
         claimed = claim(where, runner.pid)
-        with suppress(BrokenPipeError), runner.stdin as order:  # a runner that has ended already is waited for below
+        with suppress(BrokenPipeError), runner.stdin as order:  # the end of the runner is handled below
             if claimed:
                 order.write(json.dumps(job.attempt).encode())
 
         def wait() -> None:
-            code = runner.wait()  # only now may its number be given again
+            code = runner.wait()  # the system may reuse the pid only after this
             if claimed and code and not (where / STARTED).exists():
                 write_json(where / ENDED, {"code": code, "time": time.time()})
 
         threading.Thread(target=wait, daemon=True).start()
 
 
-def _is_job(kept: Mapping[str, Any]) -> bool:
-    """Whether the entries of a job.json are there, and of the right kind."""
-    if set(kept) != set(KEPT) or not all(isinstance(kept[name], kind) for name, kind in KEPT.items()):
+def _is_job(entries: Mapping[str, Any]) -> bool:
+    """Return whether the entries of a job.json are complete and of the right types."""
+    if set(entries) != set(ENTRIES) or not all(isinstance(entries[name], kind) for name, kind in ENTRIES.items()):
         return False
-    return all(words and all(isinstance(w, str) for w in words) for words in (kept["arguments"], kept["attempt"]))
+    return all(words and all(isinstance(w, str) for w in words) for words in (entries["arguments"], entries["attempt"]))
 
 
 def _owner(where: Path) -> Path:
-    """The file that says whose a run is."""
+    """Return the file whose name is the owner of a run."""
     return next(where.glob(f"{OWNER}*"), where / WAITING)
 
 
-def _owned(owner: Path) -> bool:
-    """Whether the process that a run belongs to is there."""
+def _owner_alive(owner: Path) -> bool:
+    """Return whether the process that owns a run is alive."""
     _, _, process = owner.name.partition(OWNER)
     pid, _, began = process.partition("-")
     return bool(began) and _alive(int(pid), float(began))
 
 
 def claim(where: Path, pid: int) -> bool:
-    """Let a run belong to a process; False where it belongs to another one already, or is gone."""
+    """Make a process the owner of a run; False if another process owns it or the run is removed."""
     import psutil
 
     owner = _owner(where)
-    if _owned(owner):
+    if _owner_alive(owner):
         return False
     try:
         owner.rename(where / f"{OWNER}{pid}-{psutil.Process(pid).create_time():.2f}")
@@ -389,17 +360,17 @@ def claim(where: Path, pid: int) -> bool:
 
 
 def _json(path: Path) -> dict[str, Any]:
-    """The entries of a JSON file; none where it is missing, damaged or just being written."""
+    """Return the entries of a JSON file; none if it is missing, damaged or incomplete."""
     try:
-        found = json.loads(path.read_text())
-        json.dumps(found, ensure_ascii=False).encode()  # half of a surrogate pair is no text that a page can show
+        content = json.loads(path.read_text())
+        json.dumps(content, ensure_ascii=False).encode()  # half a surrogate pair cannot be displayed
     except (OSError, ValueError, RecursionError):
         return {}
-    return found if isinstance(found, dict) else {}
+    return content if isinstance(content, dict) else {}
 
 
 def _alive(pid: int, began: float) -> bool:
-    """Whether the process that was started then is there: numbers are given again."""
+    """Return whether the process with this start time is alive; a pid alone may be reused."""
     import psutil
 
     try:

@@ -13,7 +13,7 @@ from nerif.app.pieces import refusals
 from nerif.app.workspace import Workspace
 from nerif.common.conventions import InputError
 from nerif.data.volume_sequence import VolumeSequence
-from nerif.report.movie import frames_there
+from nerif.report.movie import finished_frames
 from nerif.results.live import read_live
 
 __all__ = ["JobsDrawer", "film_progress", "progress_of"]
@@ -36,7 +36,7 @@ NAMES = {
 
 
 def progress_of(work: Workspace, job: Job) -> tuple[float, str]:
-    """Return how far a run is, from 0 to 1, and what it is doing; of one that does not tell, 0 and nothing."""
+    """Return the progress of a run, from 0 to 1, and its current work; 0 and nothing if unknown."""
     if job.out.endswith(".zarr") and job.state in ("running", "paused"):
         return film_progress(work.project.path(job.out))
     live = read_live(work.project.path(job.out)) if job.out and job.state in ("running", "paused") else {}
@@ -53,7 +53,7 @@ def film_progress(path: Path) -> tuple[float, str]:
         store = VolumeSequence(path)
     except InputError:  # just being made
         return 0.0, ""
-    done, count = len(frames_there(store)), len(store)
+    done, count = len(finished_frames(store)), len(store)
     return done / max(count, 1), f"{done} of {count} frames"
 
 
@@ -88,7 +88,7 @@ class JobsDrawer:
         jobs, progress = await self.work.beside(self._look)
         open_ = sum(job.state in ("running", "queued", "paused") for job in jobs)
         self.button.set_text(f"Runs ({open_})" if open_ else "Runs")
-        state = repr([(j.id, j.state, j.asked, j.place) for j in jobs]) + repr(progress)
+        state = repr([(j.id, j.state, j.request, j.place) for j in jobs]) + repr(progress)
         if state == self._shown:
             return
         self._shown = state
@@ -104,10 +104,10 @@ class JobsDrawer:
         return jobs, {job.id: progress_of(self.work, job) for job in jobs}
 
     def _row(self, job: Job, share: float, title: str) -> None:
-        said = f"{job.state}, {job.asked} asked" if job.state == "running" and job.asked else job.state
+        lines = f"{job.state}, {job.request} requested" if job.state == "running" and job.request else job.state
         with ui.element("div").classes(f"run {job.state}").props('role="listitem"'):
             ui.html(
-                f"<b>{escape(job.title)}</b><span class=state>{escape(said)} {escape(title)}</span>"
+                f"<b>{escape(job.title)}</b><span class=state>{escape(lines)} {escape(title)}</span>"
                 f"<code>{escape(job.line)}</code>", sanitize=False,
             )  # fmt: skip
             if job.state == "refused":

@@ -35,7 +35,7 @@ class LiveSurface:
         self.place.clear()
         self._scene, self._shown = None, []
 
-    def show(self, name: str, stamp: int, box: Box, said: str) -> None:
+    def show(self, name: str, stamp: int, box: Box, lines: str) -> None:
         """Show the surface of a look.
 
         Parameters
@@ -43,18 +43,18 @@ class LiveSurface:
         name : of the result directory, relative to the project
         stamp : that changes with each look
         box : mm
-        said : what is seen, in words
+        lines : description of the view
         """
         if self._scene is None or self._scene.box != box:
             self.forget()
             with self.place:
-                self._scene = BoxScene(box, said, SIZE)
+                self._scene = BoxScene(box, lines, SIZE)
                 self._caption = ui.html("", sanitize=False)
         for surface in self._shown[:-1]:  # the last one stays until this one is there
             surface.delete()
         self._shown = [*self._shown[-1:], self._scene.add(live_address(name, stamp), COLOUR)]
-        self._scene.name(f"{said} Drag to turn, scroll to come nearer.")
-        self._caption.set_content(f"<figcaption>{escape(said)}</figcaption>")
+        self._scene.name(f"{lines} Drag to turn, scroll to come nearer.")
+        self._caption.set_content(f"<figcaption>{escape(lines)}</figcaption>")
 
 
 def said_of(look: Look) -> str:

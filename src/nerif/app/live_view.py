@@ -20,10 +20,10 @@ from nerif.data.volume import name_of
 from nerif.geometry import Box
 from nerif.plotting.drawing import colour_range, map_range
 from nerif.report.view_images import image_address
-from nerif.results.directory import LIVE, LIVE_LOOK
+from nerif.results.directory import LIVE, LIVE_FIELD
 from nerif.results.live import Look, read_live, read_look
 
-__all__ = ["LiveView", "curve_options", "look_html", "told"]
+__all__ = ["LiveView", "curve_options", "look_html", "notice"]
 
 EVERY = 1.0  # seconds
 CURVES = ("loss", "residual", "residual_over_sigma", "fit_loss")
@@ -45,7 +45,7 @@ class LiveView:
             self.choice = ui.select({}, label="Run", on_change=lambda e: self.follow(e.value)).props(
                 'outlined dense options-dense aria-label="Run"'
             )
-            self.told = ui.html("", sanitize=False).classes("told").props('aria-live="off"')
+            self.notice = ui.html("", sanitize=False).classes("status").props('aria-live="off"')
             self.bar = ui.linear_progress(0.0, show_value=False).props('aria-label="Progress"')
             with ui.row().classes("gap-2"):
                 self.buttons = {
@@ -79,7 +79,7 @@ class LiveView:
             self.choice.set_options(options, value=self.job if self.job in options else None)
         job = next((job for job in jobs if job.id == self.job), None)
         for name, button in self.buttons.items():
-            state = "" if job is None or (job.asked and job.state == "running") else job.state
+            state = "" if job is None or (job.request and job.state == "running") else job.state
             button.set_visibility(state in SHOWN[name])
         self.bar.set_visibility(job is not None)
         if job is not None:
@@ -89,63 +89,63 @@ class LiveView:
         out = self.work.project.path(job.out)
         if out.suffix == ".zarr":
             share, title = await self.work.beside(film_progress, out)
-            self.told.set_content(told(job, {}, title))
+            self.notice.set_content(notice(job, {}, title))
             self.bar.set_value(share)
             self.chart.set_visibility(False)
             return
-        seen = self._seen
-        live, drawn = await self.work.beside(_changed, out, seen)
-        if seen is not self._seen:  # another run has been chosen meanwhile
+        visible = self._seen
+        live, plot = await self.work.beside(_changed, out, visible)
+        if visible is not self._seen:  # another run has been chosen meanwhile
             return
-        self.told.set_content(told(job, live))
+        self.notice.set_content(notice(job, live))
         self.bar.set_value(float(live.get("progress") or 0.0) if live else float(job.state == "done"))
         if live and live.get("curve"):
             self.chart.set_visibility(True)
             self.chart.options.clear()
             self.chart.options.update(curve_options(live["curve"]))
-        if drawn is not None:
-            images, box, said = drawn
+        if plot is not None:
+            images, box, lines = plot
             self.look.set_content(images)
-            if said:
-                self.surface.show(job.out, seen[LIVE_LOOK], box, said)
+            if lines:
+                self.surface.show(job.out, visible[LIVE_FIELD], box, lines)
 
 
-def _changed(out: Path, seen: dict[str, Any]) -> tuple[dict[str, Any], tuple[str, Box, str] | None]:
-    """What the run tells; of its last look, where it is not in `seen` yet, images, box, and its surface in words."""
-    stamp = _stamp(out / LIVE_LOOK)
-    drawn = None
-    if stamp and stamp != seen.get(LIVE_LOOK):
-        seen[LIVE_LOOK] = stamp
+def _changed(out: Path, visible: dict[str, Any]) -> tuple[dict[str, Any], tuple[str, Box, str] | None]:
+    """The status of the run; of its last live field, if it is new: images, box, and its surface in words."""
+    stamp = _stamp(out / LIVE_FIELD)
+    plot = None
+    if stamp and stamp != visible.get(LIVE_FIELD):
+        visible[LIVE_FIELD] = stamp
         look = read_look(out)
         if look is not None:
             volume = look.volume  # a flat one has no surface
-            said = said_of(look) if min(volume.grid.shape) > 1 else ""
-            drawn = look_html(look), volume.grid.box, said
-    if (new := _stamp(out / LIVE)) != seen.get(LIVE):
-        seen[LIVE], seen["live"] = new, read_live(out)
-    return seen.get("live", {}), drawn
+            lines = said_of(look) if min(volume.grid.shape) > 1 else ""
+            plot = look_html(look), volume.grid.box, lines
+    if (new := _stamp(out / LIVE)) != visible.get(LIVE):
+        visible[LIVE], visible["live"] = new, read_live(out)
+    return visible.get("live", {}), plot
 
 
 def _stamp(path: Path) -> int:
     return path.stat().st_mtime_ns if path.is_file() else 0
 
 
-def told(job: Job, live: dict[str, Any], title: str = "") -> str:
+def notice(job: Job, live: dict[str, Any], title: str = "") -> str:
     """Return in words, as HTML, what a run is doing; `title` says it of a film, which has no live.json."""
     words = {"done": "It has ended.", "paused": "Paused: its checkpoint is kept.", "queued": "It waits for its turn."}
-    said = words.get(job.state, job.state.capitalize() + ".")
+    lines = words.get(job.state, job.state.capitalize() + ".")
     if job.state == "running":
-        said = {"stop": "Stopping after this step.", "pause": "Pausing after this step."}.get(job.asked, "It runs.")
+        lines = {"stop": "Stopping after this step.", "pause": "Pausing after this step."}.get(job.request, "It runs.")
         if not live and not title:
-            said += " Nothing is told yet."
-    parts = [said, title] if title else [said]
+            lines += " No report yet."
+    parts = [lines, title] if title else [lines]
     if live:
         seconds, share = float(live["seconds"] or 0), float(live["progress"] or 0)
         parts.append(f"{live['title'].capitalize()}: step {live['step']}, {seconds:.0f} s")
         if job.state == "running" and 0.001 < share < 1:
             parts.append(f"{seconds * (1 / share - 1):.0f} s left")
-        known = {name: value for name, value in live["losses"].items() if value is not None}
-        parts += [f"{name.replace('_', ' ')} {value:.3g}" for name, value in known.items()]
+        available = {name: value for name, value in live["losses"].items() if value is not None}
+        parts += [f"{name.replace('_', ' ')} {value:.3g}" for name, value in available.items()]
     remark = f"<p class=note>{escape(live['remark'])}</p>" if live.get("remark") else ""
     return f"<p>{escape(' · '.join(parts))}</p>{remark}"
 
@@ -179,12 +179,12 @@ def look_html(look: Look) -> str:
         measured, predicted = look.measured[..., c], look.predicted[..., c]
         limits = map_range(measured[np.isfinite(measured)], True, 0.998)
         ends = f"{limits[0]:.2g} to {limits[1]:.2g} {unit}".strip()
-        seen = "held out" if look.withheld else "not held out"
-        known = np.isfinite(measured)
-        rms = math.sqrt(float(np.mean((predicted - measured)[known] ** 2)))
-        for what, image in (("measured", measured), ("predicted", np.where(known, predicted, np.nan))):
+        visible = "withheld" if look.withheld else "not withheld"
+        available = np.isfinite(measured)
+        rms = math.sqrt(float(np.mean((predicted - measured)[available] ** 2)))
+        for what, image in (("measured", measured), ("predicted", np.where(available, predicted, np.nan))):
             apart = "" if what == "measured" else f"; rms apart {rms:.2g} {unit}"
-            text = f"{look.view} ({seen}), {component} {what}; {ends}{apart}"
+            text = f"{look.view} ({visible}), {component} {what}; {ends}{apart}"
             figures.append((image_address(image, limits), text))
     z, y, x = (n // 2 for n in look.values.shape)
     limits = colour_range(look.values)

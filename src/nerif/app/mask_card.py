@@ -129,7 +129,7 @@ class MaskCard:
     async def _threshold(self) -> None:
         index = self.measurement.names.index(str(self.view.value))
         with refusals():
-            record = self.job.view.made()
+            record = self.job.view.record()
             settings: MaskSettings = record.masks
             address = await self.work.beside(threshold_address, self.measurement, index, settings, record.sigma)
             with ui.dialog() as dialog, ui.card():

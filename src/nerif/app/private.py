@@ -28,8 +28,8 @@ def _directory() -> Path:
     InputError
         If it cannot be made or written to.
     """
-    given = Path(os.environ.get("XDG_STATE_HOME", ""))
-    where = (given if given.is_absolute() else Path.home() / ".local" / "state") / "nerif"
+    entry = Path(os.environ.get("XDG_STATE_HOME", ""))
+    where = (entry if entry.is_absolute() else Path.home() / ".local" / "state") / "nerif"
     try:
         where.mkdir(mode=0o700, parents=True, exist_ok=True)
     except OSError as error:
@@ -71,8 +71,8 @@ def secret() -> bytes:
         part.unlink()
     with path.open("rb") as file:
         about, content = os.fstat(file.fileno()), file.read()
-    own = os.name != "posix" or (about.st_uid == os.geteuid() and not about.st_mode & 0o077)
-    if not own or len(content) != LENGTH:
+    origin_ = os.name != "posix" or (about.st_uid == os.geteuid() and not about.st_mode & 0o077)
+    if not origin_ or len(content) != LENGTH:
         got = f"{len(content)} bytes with mode {about.st_mode & 0o777:03o} of user {about.st_uid}"
         raise InputError(
             f"expected {LENGTH} bytes that you alone can read (mode 600), got {got}; delete it, and start "

@@ -1,4 +1,4 @@
-"""A project: a folder, and what is in it. Nothing else is kept of it; what is in the folder is read anew each time."""
+"""A project: a folder and its content, which is read again each time."""
 
 from __future__ import annotations
 
@@ -95,11 +95,11 @@ class Project:
         """Return a path in the folder relative to it, as the command line is given it."""
         return str(self.path(path).relative_to(self.folder))
 
-    def free_name(self, stem: str, taken: Collection[str] = ()) -> str:
+    def free_name(self, stem: str, occupied: Collection[str] = ()) -> str:
         """Return the first of stem, stem-2, stem-3, ... that is not there, nor among the names `taken`."""
         first, ending = os.path.splitext(stem)
         names = (stem if i == 1 else f"{first}-{i}{ending}" for i in range(1, MANY))
-        return next(name for name in names if name not in taken and not self.path(name).exists())
+        return next(name for name in names if name not in occupied and not self.path(name).exists())
 
     def views(self, experiment: str) -> tuple[View, ...]:
         """Return the views of a folder of images; InputError where there are none."""
@@ -114,16 +114,16 @@ class Project:
         what : of it is kept, such as "thumbnail"
         """
         path = self.path(name)
-        found = path.stat()
-        stamp, key = (found.st_mtime_ns, found.st_size), (str(path), what)
-        kept = self._cache.get(key)
-        if kept is None or kept[0] != stamp:
-            kept = self._cache[key] = (stamp, read(path))
-        return kept[1]  # type: ignore[return-value]
+        outcome = path.stat()
+        stamp, key = (outcome.st_mtime_ns, outcome.st_size), (str(path), what)
+        memory = self._cache.get(key)
+        if memory is None or memory[0] != stamp:
+            memory = self._cache[key] = (stamp, read(path))
+        return memory[1]  # type: ignore[return-value]
 
     def contents(self) -> Contents:
         """Look through the folder."""
-        found: dict[str, list[str]] = {name: [] for name in Contents.__dataclass_fields__ if name != "unread"}
+        outcome: dict[str, list[str]] = {name: [] for name in Contents.__dataclass_fields__ if name != "unread"}
         unread: list[tuple[str, str]] = []
         for path in self._walk(self.folder, DEEP, [0], unread):
             name = str(path.relative_to(self.folder))
@@ -138,10 +138,10 @@ class Project:
                 unread.append((name, str(error)))
                 continue
             if kind:
-                found[kind].append(name)
-        return Contents(**{k: tuple(sorted(v)) for k, v in found.items()}, unread=tuple(unread))
+                outcome[kind].append(name)
+        return Contents(**{k: tuple(sorted(v)) for k, v in outcome.items()}, unread=tuple(unread))
 
-    def _walk(self, folder: Path, deep: int, seen: list[int], unread: list[tuple[str, str]]) -> Iterator[Path]:
+    def _walk(self, folder: Path, deep: int, visible: list[int], unread: list[tuple[str, str]]) -> Iterator[Path]:
         """The folder itself, its files, and the folders in it that are no store or result themselves."""
         yield folder
         try:
@@ -150,8 +150,8 @@ class Project:
             unread.append((str(folder.relative_to(self.folder)), error.strerror or str(error)))
             return
         for entry in entries:
-            seen[0] += 1
-            if entry.name.startswith(".") or seen[0] > MANY:
+            visible[0] += 1
+            if entry.name.startswith(".") or visible[0] > MANY:
                 continue
             path = Path(entry.path)
             if not entry.is_dir(follow_symlinks=False):
@@ -160,7 +160,7 @@ class Project:
                 yield path
                 yield from (p for p in (path / "measurement.nc",) if p.is_file())
             elif deep:
-                yield from self._walk(path, deep - 1, seen, unread)
+                yield from self._walk(path, deep - 1, visible, unread)
 
     def _kind(self, path: Path) -> str:
         """Name of the list of Contents that it belongs to; empty if to none."""

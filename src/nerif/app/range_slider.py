@@ -20,15 +20,15 @@ class RangeSlider:
     last : highest step
     value : to begin with
     shown : text of a step
-    on_change : told the step while it is moved
-    settled : told only when it is let go of, for what takes longer
+    on_change : called with the step while it is moved
+    settled : called with the step when it is released
     """
 
     def __init__(
-        self, label: str, last: int, value: int, shown: Callable[[int], str],
+        self, label: str, last: int, value: int, display: Callable[[int], str],
         on_change: Callable[[int], Awaitable[None]], settled: bool = False,
     ) -> None:  # fmt: skip
-        self.value, self._shown, self._label = value, shown, label
+        self.value, self._shown, self._label = value, display, label
         with ui.element("div").classes("slider"):
             self._text = ui.html("", sanitize=False).classes("at")
             self._input = ui.element("input").classes("range")
@@ -44,7 +44,7 @@ class RangeSlider:
         self._say()
 
     def put(self, value: int) -> None:
-        """Move it; whoever is told of moves by hand is not told."""
+        """Move it without calling on_change."""
         self.value = value
         self._input.run_method("setAttribute", "value", str(value))
         self._input.props(f"value={value}")

@@ -1,6 +1,6 @@
 """Answers of the server beside its pages: the report of a result, isosurfaces of a quantity and of a run that goes on.
 
-A report is a page that somebody may have been sent: it stands in a sandbox of its own, with no way to this server.
+A report may come from another person: it is shown in a sandbox without access to this server.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ def report_address(name: str, stamp: int) -> str:
 
 def surface_address(name: str, quantity: str, level: float, frame: int, stamp: int) -> str:
     """Return the address of an isosurface."""
-    asked = {"of": name, "quantity": quantity, "level": repr(level), "frame": frame, "stamp": stamp}
-    return "/surface?" + urlencode(asked, quote_via=quote)
+    query = {"of": name, "quantity": quantity, "level": repr(level), "frame": frame, "stamp": stamp}
+    return "/surface?" + urlencode(query, quote_via=quote)
 
 
 def live_address(name: str, stamp: int) -> str:
@@ -70,10 +70,10 @@ def _surface(work: Workspace) -> Answer:
         return stl_of(surface_triangles(source_of(work.project.path(name)).volume(quantity, frame), level))
 
     async def answer(request: Request) -> Response:
-        asked = request.query_params
+        query = request.query_params
         try:
-            level, frame = float(asked.get("level", "0")), int(asked.get("frame", "0"))
-            stl = await work.beside(made, asked.get("of", ""), asked.get("quantity", ""), level, frame)
+            level, frame = float(query.get("level", "0")), int(query.get("frame", "0"))
+            stl = await work.beside(made, query.get("of", ""), query.get("quantity", ""), level, frame)
         except (InputError, ValueError) as error:
             return PlainTextResponse(str(error), 404)
         return Response(stl, media_type="model/stl", headers={"cache-control": KEPT})

@@ -63,10 +63,10 @@ class ResultLook:
         if not quantities:
             text_html(f"{self.name}: no field in it.", classes="note")
             return
-        kept = str(self.draft.get("quantity", ""))
+        memory = str(self.draft.get("quantity", ""))
         options = {q: describe(q)[1].capitalize() for q in quantities}
         with ui.element("div").classes("choices"):
-            self.quantity = _select("Quantity", options, kept if kept in options else quantities[0])
+            self.quantity = _select("Quantity", options, memory if memory in options else quantities[0])
             against = str(self.draft.get("against", ""))
             choices = {"": "Nothing", **{name: name for name in self.others}}
             self.against = _select("Compare with", choices, against if against in choices else "")
@@ -76,7 +76,7 @@ class ResultLook:
         self.time: RangeSlider | None = None
         if len(self.source.frames) > 1:
             self._build_time()
-        self.said = ui.html("", sanitize=False).props("aria-live=polite")
+        self.lines = ui.html("", sanitize=False).props("aria-live=polite")
         self.slices = SlicesView(self.work)
         await self.draw()
 
@@ -139,7 +139,7 @@ class ResultLook:
             panels, note = await self.work.beside(self._panels, quantity, self.against.value, self.step)
         except InputError as error:
             panels, note = [], f"{error}."
-        self.said.set_content(f"<p class=note>{escape(note)}</p>" if note else "")
+        self.lines.set_content(f"<p class=note>{escape(note)}</p>" if note else "")
         await self.slices.show(panels)
 
     def _open(self, name: str) -> Source:
@@ -200,11 +200,11 @@ class ResultLook:
             text_html("The field is a plane: there is no surface in it.", classes="note")
             return
         view = SurfaceView(quantity, _unit(volume), limits, level, volume.grid.box)
-        shown = [self._shown(self.name, self.frame)]
+        display = [self._shown(self.name, self.frame)]
         if against:
             other = await self.work.beside(self._open, against)
-            shown.append(self._shown(against, self._at(other, against, self.step)))
-        view.show(shown)
+            display.append(self._shown(against, self._at(other, against, self.step)))
+        view.show(display)
 
     def _surface(self, quantity: str) -> tuple[Volume, tuple[float, float], float]:
         assert self.source is not None

@@ -8,13 +8,13 @@ from html import escape
 
 from nicegui import ui
 
-from nerif.analysis.evaluation import rms_text
+from nerif.analysis.evaluation import rms_with_unit
 from nerif.analysis.verdict import verdict
 from nerif.app.project import Contents, Project
 from nerif.common.conventions import InputError
 from nerif.data.volume_sequence import VolumeSequence
 from nerif.reconstruction.files import FIELD
-from nerif.report.movie import frames_there
+from nerif.report.movie import finished_frames
 from nerif.report.summary import accuracy_rows
 from nerif.results.directory import LIVE, METRICS, RUN, VOLUME, Result, ResultDirectory
 
@@ -53,20 +53,20 @@ def rows_of(project: Project, contents: Contents) -> list[Row]:
 
 
 def _cached(project: Project, name: str) -> Row:
-    """A row, read anew when the file that was written last among those it rests on has changed."""
+    """A row, read again when the newest of its files has changed."""
     out = ResultDirectory(project.path(name))
     last = max(filter(out.has, (METRICS, FIELD, RUN, LIVE, VOLUME)), key=lambda n: (out / n).stat().st_mtime_ns)
     return project.cached(f"{name}/{last}", "row", lambda _: _of(name, out.read(views=False)))
 
 
 def _of(name: str, result: Result) -> Row:
-    found, metrics = verdict(result), result.metrics
+    match, metrics = verdict(result), result.metrics
     views = [v for v in metrics.get("views", []) if v.get("rms") is not None]
-    worst = rms_text(max(views, key=lambda v: float(v["rms"])), 3) if views else ""
+    worst = rms_with_unit(max(views, key=lambda v: float(v["rms"])), 3) if views else ""
     outcome = str(metrics.get("outcome") or result.about.get("outcome") or "not ended").replace("_", " ")
     seconds = metrics.get("seconds", result.about.get("seconds"))
-    error = "" if found.error is None else f"{found.error:.1%} of the variation"
-    ended, word, sentence = bool(metrics), found.word, found.sentence
+    error = "" if match.error is None else f"{match.error:.1%} of the variation"
+    ended, word, sentence = bool(metrics), match.word, match.sentence
     if not ended:
         word, sentence = "", " ".join(gap.sentence for gap in result.missing) or "Nothing of it is known yet."
     time = "" if seconds is None else f"{float(seconds):.0f} s"
@@ -80,7 +80,7 @@ def _film(project: Project, name: str) -> Row | None:
         store = VolumeSequence(project.path(name))
     except InputError:
         return None
-    count, done = len(store), len(frames_there(store))
+    count, done = len(store), len(finished_frames(store))
     span = f"{store.times[0]:g} to {store.times[-1]:g} s" if count else ""
     outcome = "complete" if done == count else f"{done} of {count} frames"
     grid = " × ".join(str(n) for n in store.grid.shape[::-1])
@@ -89,7 +89,7 @@ def _film(project: Project, name: str) -> Row | None:
     return Row(name, cells, "", f"{done} of {count} frames can be shown.", figures, film=True)
 
 
-def result_table(rows: Sequence[Row], chosen: str, choose: Callable[[str], Awaitable[None]]) -> None:
+def result_table(rows: Sequence[Row], selection: str, choose: Callable[[str], Awaitable[None]]) -> None:
     """Build the table, with a button in each row that shows it."""
     around = ui.element("div").classes("tabled").props('tabindex=0 role=region aria-label="Results"')
     with around, ui.element("table"):
@@ -98,15 +98,15 @@ def result_table(rows: Sequence[Row], chosen: str, choose: Callable[[str], Await
                 ui.html(escape(title), sanitize=False, tag="th").props("scope=col")
         with ui.element("tbody"):
             for row in rows:
-                _line(row, row.name == chosen, choose)
+                _line(row, row.name == selection, choose)
 
 
-def _line(row: Row, chosen: bool, choose: Callable[[str], Awaitable[None]]) -> None:
-    with ui.element("tr").classes("chosen" if chosen else ""):
+def _line(row: Row, selection: bool, choose: Callable[[str], Awaitable[None]]) -> None:
+    with ui.element("tr").classes("chosen" if selection else ""):
         with ui.element("th").props("scope=row"):
             button = ui.button(row.name, on_click=lambda: choose(row.name)).props("flat dense no-caps align=left")
             button.props["aria-label"] = f"Show {row.name}"
-            button.props["aria-pressed"] = "true" if chosen else "false"
+            button.props["aria-pressed"] = "true" if selection else "false"
         for title, cell in zip(HEAD[1:], row.cells, strict=True):
             verdict_class = f"verdict {CLASSES.get(row.word, '')}" if title == "Verdict" and cell else ""
             ui.html(escape(cell), sanitize=False, tag="td").classes(verdict_class)

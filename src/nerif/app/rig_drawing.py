@@ -36,10 +36,10 @@ def rig_drawing(cameras: Sequence[Camera], flow_size: float) -> str:
         y = height - (float(point[1] - low[1]) + EDGE * reach) * unit
         return f"{x:.1f},{y:.1f}"
 
-    seen, things = [], []
+    visible, things = [], []
     for camera, (lens, ends) in zip(cameras, rays, strict=True):
         corners = " ".join(map(at, (lens[0], ends[0], ends[1], lens[1])))
-        seen.append(f'<polygon points="{corners}" fill="var(--plot)" opacity="0.07"/>')
+        visible.append(f'<polygon points="{corners}" fill="var(--plot)" opacity="0.07"/>')
         a, b = (at(end).split(",") for end in ends)
         things.append(
             f'<line x1="{a[0]}" y1="{a[1]}" x2="{b[0]}" y2="{b[1]}" stroke="currentColor" stroke-width="5">'
@@ -58,9 +58,9 @@ def rig_drawing(cameras: Sequence[Camera], flow_size: float) -> str:
         f'stroke="currentColor" stroke-width="2.5"/><text x="20" y="{height - 34:.1f}" font-size="22" '
         f'fill="currentColor">{bar:g} mm</text>'
     )
-    said = f"The rig from above, to scale: {len(cameras)} cameras, their backgrounds, and the flow between them"
-    inside = "".join((*seen, flow, *things, scale))
-    return f'<svg viewBox="0 0 {width:.0f} {height:.0f}" role="img" aria-label="{said}">{inside}</svg>'
+    lines = f"The rig from above, to scale: {len(cameras)} cameras, their backgrounds, and the flow between them"
+    inside = "".join((*visible, flow, *things, scale))
+    return f'<svg viewBox="0 0 {width:.0f} {height:.0f}" role="img" aria-label="{lines}">{inside}</svg>'
 
 
 def _outline(camera: Camera) -> tuple[torch.Tensor, torch.Tensor]:

@@ -1,4 +1,4 @@
-"""The rig in 3-D, to be turned with the mouse: what cameras see, backgrounds, box; and a table of the cameras."""
+"""The rig in 3-D, turned with the mouse: fields of view, backgrounds, box; and a table of the cameras."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Rig:
     cameras : those that can be drawn
     missing : what is not known of the others
     box : or None
-    errors : of the images it was made from, none if the file does not tell them
+    errors : of the images of the calibration, none if the file has none
     """
 
     cameras: tuple[Camera, ...]
@@ -64,8 +64,8 @@ def show_rig(rig: Rig) -> None:
     scene = ui.scene(width=1080, height=460, grid=False, camera=camera, background_color="#eef1f4")
     scene.classes("surface").props('role=img aria-label="The rig; drag to turn, scroll to come nearer"')
     middle = np.zeros(3) if rig.box is None else np.array(rig.box.centre)
-    seen = [image_corners(c, middle) for c in rig.cameras]
-    points = np.concatenate([np.concatenate([s.start, s.end]) for s in seen] + [middle[None]])
+    visible = [image_corners(c, middle) for c in rig.cameras]
+    points = np.concatenate([np.concatenate([s.start, s.end]) for s in visible] + [middle[None]])
     centre, reach = (points.max(axis=0) + points.min(axis=0)) / 2, float(np.ptp(points, axis=0).max()) or 1.0
     scale = SIZE / reach
 
@@ -77,7 +77,7 @@ def show_rig(rig: Rig) -> None:
             line(a, b, colour)
 
     with scene:
-        for i, (one, corners) in enumerate(zip(rig.cameras, seen, strict=True)):
+        for i, (one, corners) in enumerate(zip(rig.cameras, visible, strict=True)):
             colour = COLOURS[i % len(COLOURS)]
             tips = corners.start + TIP * reach * corners.direction
             outline(tips, colour)
@@ -109,10 +109,10 @@ def show_rig(rig: Rig) -> None:
 def _table(cameras: Sequence[Camera], errors: Sequence[ImageError]) -> str:
     rows = []
     for camera in cameras:
-        own = [e for e in errors if e.camera == camera.name]
+        local = [e for e in errors if e.camera == camera.name]
         height, width = camera.image_size
-        used = f"{sum(e.used for e in own)} of {len(own)}" if own else "not told"
-        rms = f"{rms_of(own):.3f}" if any(e.used for e in own) else "not told"
+        used = f"{sum(e.used for e in local)} of {len(local)}" if local else "unknown"
+        rms = f"{rms_of(local):.3f}" if any(e.used for e in local) else "unknown"
         place = ", ".join(f"{round(float(x), 1) + 0.0:.1f}" for x in camera.centre)
         cells = (f"{width} × {height}", f"{float(camera.intrinsics[0, 0]):.1f}", place, used, rms)
         line = "".join(f"<td>{escape(cell)}</td>" for cell in cells)

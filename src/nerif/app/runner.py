@@ -26,7 +26,7 @@ def main(directory: Path, words: Sequence[str]) -> None:
     """Run nerif with these arguments and wait for its end."""
     import psutil
 
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # what a shell ignores in the background is no wish here
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell ignores it for background jobs
     arguments = [sys.executable, "-P", "-m", "nerif", *words]  # -P: no module of the folder is imported
     environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
     with (directory / LOG).open("ab") as log:
@@ -35,7 +35,7 @@ def main(directory: Path, words: Sequence[str]) -> None:
         )
         began = psutil.Process(process.pid).create_time()
         write_json(directory / STARTED, {"pid": process.pid, "began": began, "time": time.time()})
-        if json.loads((directory / JOB).read_text())["asked"]:  # to stop, before it could be told itself
+        if json.loads((directory / JOB).read_text())["request"]:  # to stop, before this process could get a signal
             process.send_signal(signal.SIGINT)
         code = process.wait()
     write_json(directory / ENDED, {"code": code, "time": time.time()})

@@ -29,7 +29,7 @@ from nerif.app.workspace import READ_ONLY, Workspace
 from nerif.cli.commands.output import say
 from nerif.common.conventions import InputError
 
-__all__ = ["Address", "serve", "told_of"]
+__all__ = ["Address", "serve", "without_address"]
 
 TRIED = 20  # ports
 LOCAL = ("127.0.0.1", "localhost", "[::1]")
@@ -65,25 +65,25 @@ class Address:
             if token is None:
                 raise InputError(
                     f"expected --token together with --host {host}, got none; others can reach that address, and "
-                    "whoever knows the token can run nerif here and read and write the folder",
+                    "anybody who knows the token can run nerif here and read and write the folder",
                     field="host",
                 )
             say(f"note: others can reach {host}: who knows the token can run nerif here and read and write the folder;")
             say("      nothing is encrypted on the way. Safer: ssh -L 8620:127.0.0.1:8620 THIS_MACHINE")
-        found = _free_port(host, port)
-        if found != port:
-            say(f"port {port} is taken; {found} is used")
-        return cls(host, found, token or secrets.token_urlsafe(24))
+        result = _free_port(host, port)
+        if result != port:
+            say(f"port {port} is taken; {result} is used")
+        return cls(host, result, token or secrets.token_urlsafe(24))
 
     @property
     def names(self) -> tuple[str, ...]:
         """What browsers may call this server: where it listens on all interfaces, by the address of any of them."""
-        own = {self.host}
+        local = {self.host}
         if not _is_local(self.host):
-            own |= {socket.gethostname(), socket.getfqdn()}
+            local |= {socket.gethostname(), socket.getfqdn()}
         if self.host in EVERYWHERE:
-            own |= _interfaces()
-        return (*LOCAL, *sorted(f"[{name}]" if ":" in name else name for name in own))
+            local |= _interfaces()
+        return (*LOCAL, *sorted(f"[{name}]" if ":" in name else name for name in local))
 
     @property
     def link(self) -> str:
@@ -103,7 +103,7 @@ def serve(folder: Path, address: Address, browser: bool = True) -> None:
     work = Workspace(Project(folder))
     if not work.project.writable:
         say(f"note: {READ_ONLY}")
-    logging.getLogger("uvicorn.error").addFilter(told_of)
+    logging.getLogger("uvicorn.error").addFilter(without_address)
     app.add_middleware(Guard, token=address.token, hosts=address.names, port=address.port)
     app.add_api_route("/", lambda: RedirectResponse(PAGES[0].path), include_in_schema=False)
     for path, answer in ROUTES.items():
@@ -120,7 +120,7 @@ def serve(folder: Path, address: Address, browser: bool = True) -> None:
             webbrowser.open(first)
 
     app.on_startup(lambda: background_tasks.create(begun()))
-    app.on_startup(lambda: work.beside(work.project.contents))  # the first look is the longest
+    app.on_startup(lambda: work.beside(work.project.contents))  # the first reading takes longest
     app.timer(QUEUE_EVERY, work.jobs.advance)
     with ExitStack() as ending:
         first = ending.enter_context(page_leading_to(address.link)) if browser else ""
@@ -141,7 +141,7 @@ FAVICON = (
 )
 
 
-def told_of(record: logging.LogRecord) -> bool:
+def without_address(record: logging.LogRecord) -> bool:
     """Whether an entry of the server's log is shown: of answers that were given up, since the browser went on, none is.
 
     Starlette's BaseHTTPMiddleware, by which NiceGUI answers, raises RuntimeError for them.
@@ -171,8 +171,8 @@ def _is_local(host: str) -> bool:
 
 def _interfaces() -> set[str]:
     """The addresses of this machine's network interfaces; its own name may lead to 127.0.1.1 alone."""
-    found = [address for interface in psutil.net_if_addrs().values() for address in interface]
-    return {a.address.partition("%")[0] for a in found if a.family in (socket.AF_INET, socket.AF_INET6)}
+    result = [address for interface in psutil.net_if_addrs().values() for address in interface]
+    return {a.address.partition("%")[0] for a in result if a.family in (socket.AF_INET, socket.AF_INET6)}
 
 
 def _free_port(host: str, port: int) -> int:

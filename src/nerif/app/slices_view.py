@@ -110,14 +110,14 @@ class SlicesView:
             while self._waiting:
                 normal = self._waiting.pop()
                 panels, index = self.panels, self._index(normal) if self.panels else 0
-                drawn = await self.work.beside(_drawn, panels, normal, index)
+                plot = await self.work.beside(_drawn, panels, normal, index)
                 if panels is self.panels:
-                    self._put(normal, index, drawn)
+                    self._put(normal, index, plot)
         finally:
             self._busy = False
 
-    def _put(self, normal: str, index: int, drawn: Sequence[str]) -> None:
-        for number, (panel, address) in enumerate(zip(self.panels, drawn, strict=True)):
+    def _put(self, normal: str, index: int, plot: Sequence[str]) -> None:
+        for number, (panel, address) in enumerate(zip(self.panels, plot, strict=True)):
             at = float(panel.volume.grid.axis(normal)[index])
             image = self._images[normal, number]
             image.props["src"] = address

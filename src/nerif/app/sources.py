@@ -11,9 +11,9 @@ from nerif.common.conventions import STATISTICS, InputError
 from nerif.data.volume import INDEX, Volume
 from nerif.data.volume_file import read_volumes
 from nerif.data.volume_sequence import VolumeSequence
-from nerif.plotting.drawing import colour_range, shown
+from nerif.plotting.drawing import colour_range, plotted_values
 from nerif.report.isosurface import default_level
-from nerif.report.movie import frames_there, ranges_over_time
+from nerif.report.movie import finished_frames, ranges_over_time
 from nerif.report.packing import coarsen
 from nerif.results.directory import VOLUME
 
@@ -68,14 +68,14 @@ class Still:
         InputError
             If the result lacks it.
         """
-        found = self._volumes
-        if quantity not in found:
-            raise InputError(f"expected one of {', '.join(found)}, got '{quantity}'", field=self.path.name)
-        return found[quantity]
+        outcome = self._volumes
+        if quantity not in outcome:
+            raise InputError(f"expected one of {', '.join(outcome)}, got '{quantity}'", field=self.path.name)
+        return outcome[quantity]
 
     def limits(self, quantity: str) -> Limits:
         """Return the ends of its colours."""
-        return colour_range(shown(self.volume(quantity)))
+        return colour_range(plotted_values(self.volume(quantity)))
 
     def level(self, quantity: str) -> float:
         """Return the level of its isosurface to begin with."""
@@ -98,7 +98,7 @@ class Film:
     def __init__(self, path: Path) -> None:
         self.path = path
         store = VolumeSequence(path)
-        self.times, self.frames = store.times, frames_there(store)
+        self.times, self.frames = store.times, finished_frames(store)
         self.quantities = _worth_showing(store.quantities)
         if not self.frames:
             raise InputError("no frame of it is done yet", field=path.name)
@@ -126,8 +126,8 @@ def source_of(path: Path) -> Source:
 
 
 def _worth_showing(quantities: Sequence[str] | dict[str, Volume]) -> tuple[str, ...]:
-    kept = [q for q in quantities if q.rpartition("_")[2] not in STATISTICS and (q != "n" or INDEX not in quantities)]
-    return tuple(name for q in kept for name in (q, f"{q}_std") if name in quantities)
+    memory = [q for q in quantities if q.rpartition("_")[2] not in STATISTICS and (q != "n" or INDEX not in quantities)]
+    return tuple(name for q in memory for name in (q, f"{q}_std") if name in quantities)
 
 
 @lru_cache(maxsize=6)

@@ -27,7 +27,7 @@ class TargetImages:
     Parameters
     ----------
     work : Workspace
-    toggled : told the name of an image that is left out, or taken again
+    toggled : called with the name of an image that is left out or used again
     """
 
     def __init__(self, work: Workspace, toggled: Callable[[str], None]) -> None:
@@ -39,7 +39,7 @@ class TargetImages:
         self, view: View, targets: Mapping[str, CalibrationTarget], errors: Mapping[str, ImageError],
         left_out: Collection[str],
     ) -> None:  # fmt: skip
-        """Show the images of a view, one after the other; what is asked for later takes the place.
+        """Show the images of a view, one after the other; a later request replaces an earlier one.
 
         Parameters
         ----------
@@ -71,7 +71,7 @@ class TargetImages:
                 name = f"{view.name}/{source}/{pose}"
                 try:
                     address = await self.work.beside(self.files.image, view, source, number, LARGEST, view.crop)
-                    found = await self.work.beside(self.files.found, view, source, number, targets[source])
+                    outcome = await self.work.beside(self.files.result, view, source, number, targets[source])
                     shape = await self.work.beside(self._shape, view, source)
                 except InputError as error:
                     with grid:
@@ -80,26 +80,26 @@ class TargetImages:
                 if turn != self._turn:
                     return
                 with grid:
-                    self._cell(name, address, found, shape, errors, name in left_out)
+                    self._cell(name, address, outcome, shape, errors, name in left_out)
 
     def _shape(self, view: View, source: str) -> tuple[int, int]:
         shape = view.open(source).shape
         return view.crop.shape_of(shape) if view.crop else shape
 
     def _cell(
-        self, name: str, address: str, found: Detection | None, shape: tuple[int, int],
+        self, name: str, address: str, outcome: Detection | None, shape: tuple[int, int],
         errors: Mapping[str, ImageError], left_out: bool,
     ) -> None:  # fmt: skip
         with ui.element("div").classes("target left-out" if left_out else "target") as cell:
-            told = _told(errors.get(name)) or (", not used" if errors and found is not None else "")
-            said = "no target found" if found is None else f"{len(found.points)} points found"
+            notice = _text(errors.get(name)) or (", not used" if errors and outcome is not None else "")
+            lines = "no target found" if outcome is None else f"{len(outcome.points)} points found"
             with ui.element("figure"):
                 ui.html(
-                    f'<span class=shot><img src="{address}" alt="{escape(f"{name}, {said}")}">'
-                    f"{_marks(found, shape)}</span><figcaption><b>{escape(name)}</b><br>{said}{told}"
+                    f'<span class=shot><img src="{address}" alt="{escape(f"{name}, {lines}")}">'
+                    f"{_marks(outcome, shape)}</span><figcaption><b>{escape(name)}</b><br>{lines}{notice}"
                     "</figcaption>", sanitize=False,
                 )  # fmt: skip
-            if found is None:
+            if outcome is None:
                 return
             out = [left_out]
             button = ui.button().props("outline no-caps dense")
@@ -125,21 +125,21 @@ def _poses(view: View, source: str) -> list[str]:
     return pose_names(view.open(source))
 
 
-def _told(error: ImageError | None) -> str:
+def _text(error: ImageError | None) -> str:
     if error is None:
         return ""
     return f", rms <b>{error.rms:.3f} px</b>{'' if error.used else ', did not fit'}"
 
 
-def _marks(found: Detection | None, shape: tuple[int, int]) -> str:
+def _marks(outcome: Detection | None, shape: tuple[int, int]) -> str:
     """A circle around each point, that of the lowest number filled."""
-    if found is None:
+    if outcome is None:
         return ""
     height, width = shape
     radius = 0.012 * max(shape)
-    first = int(found.ids.argmin())
+    first = int(outcome.ids.argmin())
     circles = "".join(
         f"<circle{' class=first' if i == first else ''} cx={u + 0.5:.2f} cy={v + 0.5:.2f} r={radius:.2f} />"
-        for i, (u, v) in enumerate(found.pixels)
+        for i, (u, v) in enumerate(outcome.pixels)
     )
     return f"<svg viewBox='0 0 {width} {height}' preserveAspectRatio=none aria-hidden=true>{circles}</svg>"

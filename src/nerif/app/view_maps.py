@@ -33,18 +33,18 @@ def maps_html(measurement: Measurement) -> str:
         height, width = camera.image_size
         step = -(-max(height, width) // PIXELS)
         part = i, slice(0, height, step), slice(0, width, step)
-        shown = {
+        display = {
             name: image_address(values[part][..., c].numpy(), (least, most))
             for c, name in enumerate(observation.components)
         }
         if sigma is not None:
-            shown["sigma"] = image_address(sigma[part].numpy(), (0.0, noisiest), "viridis")
-        shown["valid"] = image_address(usable[part].numpy().astype(float), (0.0, 1.0), "gray")
+            display["sigma"] = image_address(sigma[part].numpy(), (0.0, noisiest), "viridis")
+        display["valid"] = image_address(usable[part].numpy().astype(float), (0.0, 1.0), "gray")
         share = float(usable[i, :height, :width].float().mean())
         figures = "".join(
             f'<figure><img src="{address}" alt="{escape(f"{name} of view {camera.name}", quote=True)}">'
             f"<figcaption>{escape(name)}</figcaption></figure>"
-            for name, address in shown.items()
+            for name, address in display.items()
         )
         parts.append(f"<h3>{escape(camera.name)}, {share:.1%} valid</h3><div class=images>{figures}</div>")
     return "".join(parts)
@@ -71,6 +71,6 @@ def threshold_address(measurement: Measurement, view: int, settings: MaskSetting
 
 def _largest(values: torch.Tensor) -> float:
     """The size that nearly all values have at most."""
-    known = values[values.isfinite()].flatten()
-    some = known[:: max(1, len(known) // 1_000_000)]
+    available = values[values.isfinite()].flatten()
+    some = available[:: max(1, len(available) // 1_000_000)]
     return float(some.quantile(QUANTILE)) or 1.0 if len(some) else 1.0

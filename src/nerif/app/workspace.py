@@ -51,11 +51,11 @@ class Workspace:
         """Return what was typed on a page and is not the default: kept over a reload, and over another start."""
         if not self._drafts and self._file.is_file():
             try:
-                found = json.loads(self._file.read_text())
+                result = json.loads(self._file.read_text())
             except ValueError:  # damaged: nothing but what was typed is lost
-                found = {}
-            kept = found if isinstance(found, dict) else {}
-            self._drafts = {name: values for name, values in kept.items() if isinstance(values, dict)}
+                result = {}
+            memory = result if isinstance(result, dict) else {}
+            self._drafts = {name: values for name, values in memory.items() if isinstance(values, dict)}
         return self._drafts.setdefault(page, {})
 
     def keep(self, page: str, values: dict[str, Any]) -> None:

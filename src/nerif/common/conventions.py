@@ -5,6 +5,7 @@ Lengths are millimetres, image quantities pixels, angles radians, times seconds.
 
 from __future__ import annotations
 
+import math
 from typing import SupportsFloat
 
 from jaxtyping import Bool, Float
@@ -26,6 +27,7 @@ __all__ = [
     "Values",
     "Vectors",
     "ambient_index",
+    "check_positive",
     "parse_faces",
     "unit_shown",
     "with_unit",
@@ -83,6 +85,15 @@ class InputError(ValueError):
         error = InputError(f"{place}: {self}")
         error.field = self.field
         return error
+
+
+def check_positive(record: object, *names: str, zero: bool = False, limit: float = math.inf) -> None:
+    """Check that numbers of a record are above 0, or 0 if `zero` is set, and at most `limit`."""
+    for name in names:
+        value = getattr(record, name)
+        if not (0 < value <= limit or (zero and value == 0)):
+            upper = f" and at most {limit:g}" if limit < math.inf else ""
+            raise InputError(f"expected a number {'from' if zero else 'above'} 0{upper}, got {value}", field=name)
 
 
 def ambient_index(value: object, name: str = "n_ambient") -> float:

@@ -107,14 +107,18 @@ class Volume:
 
     def summary(self) -> list[tuple[str, str]]:
         """Return names and values with units of a short description."""
-        from nerif.plotting.drawing import LABELS, shown
+        from nerif.plotting.drawing import LABELS, plotted_values
         from nerif.plotting.notebook import span
 
         shape = " × ".join(str(n) for n in self.grid.shape[::-1])
         edges = " × ".join(f"{e:g}" for e in self.grid.box.edges)
         _, unit = LABELS.get(self.quantity, ("", self.unit))
         name = "n − 1" if self.quantity == "n" else self.quantity.replace("_", " ").capitalize()
-        rows = [(name, span(shown(self), unit)), ("Voxels", f"{shape} (x, y, z)"), ("Volume", f"{edges} mm (x, y, z)")]
+        rows = [
+            (name, span(plotted_values(self), unit)),
+            ("Voxels", f"{shape} (x, y, z)"),
+            ("Volume", f"{edges} mm (x, y, z)"),
+        ]
         return rows + ([] if self.n_ambient is None else [("Ambient index", f"{self.n_ambient:.7g}")])
 
     def _repr_html_(self) -> str:

@@ -43,7 +43,7 @@ class SymmetricNetwork(Network):
 
     def pull_back(self, p: Tensor, encoded: Tensor, cotangent: Tensor) -> Float[Tensor, "n 3"]:
         slope = encode_pullback(encoded, cotangent, self.waves)
-        return self.symmetry.turned_back(self.symmetry.local(p).to(slope), slope)
+        return self.symmetry.gradient(self.symmetry.local(p).to(slope), slope)
 
     def _value(self, p: Tensor, h: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
         if self.layered:
@@ -61,7 +61,7 @@ class SymmetricNetwork(Network):
 
     def _gradient_heads(self, p: Tensor, h: Tensor) -> Tensor:
         slope = super()._gradient_heads(p, h)
-        return self.symmetry.turned_back(self.symmetry.local(p).to(slope), slope)
+        return self.symmetry.gradient(self.symmetry.local(p).to(slope), slope)
 
 
 def symmetry_of_field(field: Field) -> Symmetry | None:
@@ -130,9 +130,9 @@ class SymmetricVoxels(Field):
         results = [part.value_and_gradient(place) for part in self.parts]
         if len(results) == 1:
             value, slope = results[0]
-            return value, self.symmetry.turned_back(w, slope)
+            return value, self.symmetry.gradient(w, slope)
         share, rise = self.symmetry.shares(w)
         values = torch.stack([value for value, _ in results], dim=-1)
         slopes = torch.stack([slope for _, slope in results], dim=-2)
-        slope = self.symmetry.turned_back(w, (share[..., None] * slopes).sum(dim=-2))
+        slope = self.symmetry.gradient(w, (share[..., None] * slopes).sum(dim=-2))
         return (share * values).sum(dim=-1), slope + (rise * values[..., None]).sum(dim=-2)

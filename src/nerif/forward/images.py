@@ -31,7 +31,15 @@ from nerif.forward.base import ForwardModel, Light, Map, Mask, PerRay, Samples, 
 from nerif.forward.deflection import LeverArm
 from nerif.geometry import Rays
 
-__all__ = ["ROUNDING_VARIANCE", "Images", "References", "difference_variance", "grey_variance", "local_mean"]
+__all__ = [
+    "ROUNDING_VARIANCE",
+    "Images",
+    "References",
+    "difference_variance",
+    "grey_variance",
+    "local_mean",
+    "masked_blur",
+]
 
 DEGREE = 4  # total, of the polynomials of gain and offset
 RIDGE = 1e-4  # of the weight of a pixel, for every term beyond the constants
@@ -316,14 +324,9 @@ class Images(LeverArm):
 
     @classmethod
     def blur(cls, maps: Mapping[str, Tensor], sizes: Sequence[tuple[int, int]], px: float) -> dict[str, Tensor]:
-        from scipy.ndimage import gaussian_filter
-
         def blurred(image: Float[Tensor, "row column"], squares: bool) -> Tensor:
             good = image.isfinite()
-            weight = torch.from_numpy(gaussian_filter(good.double().numpy(), px)).clamp(min=1e-6)
-            filled = torch.where(good, image, 0.0).double()
-            filled = filled.square() if squares else filled
-            mean = torch.from_numpy(gaussian_filter(filled.numpy(), px)) / weight
+            mean = masked_blur((image.double().square() if squares else image)[..., None], good, px)[..., 0]
             # the mean over 4 pi px^2 pixels reduces the variance
             mean = (mean / max(4 * math.pi * px**2, 1.0)).sqrt() if squares else mean
             return torch.where(good, mean, math.nan).float()
@@ -429,6 +432,15 @@ def _of_patches(rays: Rays, pixels: int) -> tuple[Tensor, Float[Tensor, "m 2"]]:
     row, column = torch.meshgrid(within, within, indexing="ij")
     pixel = corner[:, None] + torch.stack([column, row], dim=-1).reshape(-1, 2)
     return rays.view.repeat_interleave(pixels), pixel.reshape(-1, 2)
+
+
+def masked_blur(values: Float[Tensor, "row column c"], good: Mask, px: float) -> Float[Tensor, "row column c"]:
+    """Return the mean of good pixels, weighted by a Gaussian of a standard deviation, in double precision."""
+    from scipy.ndimage import gaussian_filter
+
+    weight = torch.from_numpy(gaussian_filter(good.double().numpy(), px)).clamp(min=1e-6)
+    filled = torch.where(good[..., None], values, 0.0).double()
+    return torch.from_numpy(gaussian_filter(filled.numpy(), (px, px, 0))) / weight[..., None]
 
 
 def grey_variance(grey: Grey, read: float, shot: float) -> Grey:

@@ -7,20 +7,6 @@ from nerif.geometry.rays import BackgroundPoints, Rays
 from nerif.geometry.rig import Ring, paper_rig
 
 __all__ = [
-    "PERSPECTIVE",
-    "PROJECTIONS",
-    "TELECENTRIC",
-    "BackgroundPoints",
-    "Box",
-    "Camera",
-    "Grid",
-    "Lens",
-    "LensDiscs",
-    "Plane",
-    "Projection",
-    "Rays",
-    "Ring",
-    "paper_rig",
-    "projection_named",
-    "spread_points",
+    "PERSPECTIVE", "PROJECTIONS", "TELECENTRIC", "BackgroundPoints", "Box", "Camera", "Grid", "Lens", "LensDiscs",
+    "Plane", "Projection", "Rays", "Ring", "paper_rig", "projection_named", "spread_points",
 ]  # fmt: skip

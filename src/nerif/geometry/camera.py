@@ -31,35 +31,22 @@ from nerif.geometry.lens import Lens, LensDiscs
 from nerif.geometry.rays import BackgroundPoints, Rays
 
 __all__ = [
-    "PERSPECTIVE",
-    "POWERS",
-    "PROJECTIONS",
-    "TELECENTRIC",
-    "Camera",
-    "Perspective",
-    "Plane",
-    "Projection",
-    "Telecentric",
-    "distort",
-    "fold",
-    "projection_named",
-    "undistort",
-]
+    "PERSPECTIVE", "POWERS", "PROJECTIONS", "TELECENTRIC", "Camera", "Perspective", "Plane", "Projection",
+    "Telecentric", "distort", "fold", "projection_named", "undistort",
+]  # fmt: skip
 
 POWERS = (2, 4, 1, 1, 6)
-"""Of the unit of (x, y), by which k1, k2, p1, p2, k3 are divided."""
-REAL = 1e-6  # imaginary part over absolute value, below which a root is real
-START, STEP = 0.9, 0.25  # of the radius of the fold: how far out Newton's method starts, and its longest step
+"""Units of k1, k2, p1, p2, k3: inverse powers of that of (x, y)."""
+MAX_IMAGINARY = 1e-6  # part of a real root, over its absolute value
+MAX_START, MAX_STEP = 0.9, 0.25  # of Newton's method, over the radius of the fold
+MAX_IMAGE_EDGE = 100_000  # px
+LATTICE = 33  # pixels along either edge that represent an image
+
+Array = TypeVar("Array", Tensor, np.ndarray)
 
 
 def distort(x: Array, y: Array, coefficients: Iterable[Any]) -> tuple[Array, Array, tuple[Array, Array, Array]]:
-    """Return x_d, y_d and their derivatives d x_d / d x, d x_d / d y = d y_d / d x, d y_d / d y.
-
-    Parameters
-    ----------
-    x, y : ideal image coordinates
-    coefficients : k1, k2, p1, p2, k3
-    """
+    """Return x_d, y_d and their derivatives d x_d / d x, d x_d / d y = d y_d / d x, d y_d / d y."""
     k1, k2, p1, p2, k3 = coefficients
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
@@ -73,64 +60,61 @@ def distort(x: Array, y: Array, coefficients: Iterable[Any]) -> tuple[Array, Arr
 
 
 def fold(coefficients: Float[Tensor, 5]) -> float:
-    """Return the radius r up to which no two points (x, y) are distorted to the same; infinite where there is no end.
+    """Return the radius below which the distortion is invertible; infinity without a limit.
 
-    Beyond, the image that a polynomial makes folds back. The derivatives are a symmetric matrix, and as long as that is
-    positive definite points stay apart. Its lowest eigenvalue is at least
+    Beyond it the polynomial folds the image back. It is invertible as long as the matrix of derivatives, which is
+    symmetric, is positive definite. Its lowest eigenvalue is at least
 
         1 + 3 k1 r^2 + 5 k2 r^4 + 7 k3 r^6 - 6 (p1^2 + p2^2)^(1/2) r
     """
     k1, k2, p1, p2, k3 = coefficients.tolist()
     roots = np.roots([7 * k3, 0.0, 5 * k2, 0.0, 3 * k1, -6 * math.hypot(p1, p2), 1.0])
-    real = roots.real[(roots.real > 0) & (np.abs(roots.imag) < REAL * np.abs(roots))]
+    real = roots.real[(roots.real > 0) & (np.abs(roots.imag) < MAX_IMAGINARY * np.abs(roots))]
     return float(real.min(initial=math.inf))
 
 
 def undistort(distorted: Pixels, coefficients: Float[Tensor, 5]) -> Pixels:
-    """Return the ideal coordinates by Newton's method (at most 20 steps); NaN where there are none before the fold."""
+    """Return the coordinates before distortion by Newton's method, at most 20 steps; NaN if there are none."""
     if not (distorted.numel() and bool(coefficients.any())):
         return distorted
     end = fold(coefficients)
     size = max(1.0, float(distorted.abs().amax()))
-    x, y = _within(distorted[..., 0], distorted[..., 1], START * end)
+    x, y = _within(distorted[..., 0], distorted[..., 1], MAX_START * end)
     for _ in range(20):
         xd, yd, (xx, cross, yy) = distort(x, y, coefficients)
-        left, below = distorted[..., 0] - xd, distorted[..., 1] - yd
-        if float(torch.maximum(left.abs(), below.abs()).amax()) < 1e-14 * size:
+        dx, dy = distorted[..., 0] - xd, distorted[..., 1] - yd
+        if float(torch.maximum(dx.abs(), dy.abs()).amax()) < 1e-14 * size:
             break
         determinant = xx * yy - cross * cross
-        step = (yy * left - cross * below) / determinant, (xx * below - cross * left) / determinant
-        aside, down = _within(step[0], step[1], STEP * end)
-        x, y = _within(x + aside, y + down, end)
+        step = (yy * dx - cross * dy) / determinant, (xx * dy - cross * dx) / determinant
+        dx, dy = _within(step[0], step[1], MAX_STEP * end)
+        x, y = _within(x + dx, y + dy, end)
     xd, yd, _ = distort(x, y, coefficients)
     error = (distorted - torch.stack([xd, yd], dim=-1)).abs().amax(dim=-1, keepdim=True)
     return torch.where(error < 1e-9 * size, torch.stack([x, y], dim=-1), torch.nan)
 
 
 def _within(x: Tensor, y: Tensor, radius: float) -> tuple[Tensor, Tensor]:
-    """The vector (x, y), no longer than that."""
+    """The vector (x, y), shortened to at most this length."""
     share = (radius / torch.hypot(x, y)).clamp(max=1)
     return x * share, y * share
 
 
-Array = TypeVar("Array", Tensor, np.ndarray)
-
-
 class Projection(ABC):
-    """From the camera's frame (mm) to its image plane, before distortion and K, and back."""
+    """From the camera's frame (mm) to its image plane (x, y), before distortion and K, and back."""
 
     name: ClassVar[str]
     """In files and settings."""
     begin: ClassVar[float]
-    """Path length before which there is no ray, mm."""
+    """Path length at which rays begin, mm."""
     shows_depth: ClassVar[bool]
-    """Whether an image changes with the depth of what it shows."""
+    """Whether the image of a point depends on its depth."""
     scale: ClassVar[str]
-    """What fx and fy of K are called."""
+    """Name of fx and fy of K."""
     unit: ClassVar[str]
-    """Of fx and fy."""
+    """Unit of fx and fy."""
     least_scale: ClassVar[float]
-    """Of fx and fy."""
+    """Lower limit of fx and fy."""
 
     @abstractmethod
     def image(self, local: Array) -> Array:
@@ -138,31 +122,28 @@ class Projection(ABC):
 
     @abstractmethod
     def slope(self, along_x: Array, along_y: Array, image: Array, local: Array) -> tuple[Array, Array, Array]:
-        """Return d g / d (X, Y, Z) of what has d g / d (x, y) = (along_x, along_y), at points and their (x, y)."""
+        """Return dg/d(X, Y, Z) of a function with dg/d(x, y) = (along_x, along_y), at points and their (x, y)."""
 
     @abstractmethod
     def lines(self, image: Pixels) -> tuple[Float[Tensor, "*#batch 3"], Points]:
-        """Return where the lines seen at (x, y) start, mm (one place if it is the same), and their directions.
-
-        The directions are of any length, and lead away from the camera.
-        """
+        """Return the origins, mm, and directions, of any length, of the lines of sight at (x, y)."""
 
     @abstractmethod
     def sight(self, local: Points) -> Points:
-        """Return the unit directions in which points are seen, away from the camera."""
+        """Return the unit directions of the lines of sight through points, away from the camera."""
 
     @abstractmethod
     def distance(self, local: Points) -> Values:
-        """Return how far the camera is from points, mm."""
+        """Return the distances of points from the camera, mm; infinity if lines of sight are parallel."""
 
     @abstractmethod
     def magnification(self, local: Points) -> Values:
-        """Return how far (x, y) moves as a point moves by 1 mm across the optical axis."""
+        """Return the shift of (x, y) per mm that a point moves across the optical axis."""
 
 
 @dataclass(frozen=True)
 class Perspective(Projection):
-    """All lines go through the optical centre."""
+    """Lines of sight pass through the optical centre."""
 
     name = "perspective"
     begin = 0.0
@@ -195,7 +176,7 @@ class Perspective(Projection):
 
 @dataclass(frozen=True)
 class Telecentric(Projection):
-    """All lines are parallel to the optical axis, and start where they cross Z = 0."""
+    """Lines of sight are parallel to the optical axis, with origins on Z = 0."""
 
     name = "telecentric"
     begin = -math.inf
@@ -227,35 +208,18 @@ class Telecentric(Projection):
 
 PERSPECTIVE, TELECENTRIC = Perspective(), Telecentric()
 PROJECTIONS: dict[str, Projection] = {kind.name: kind for kind in (PERSPECTIVE, TELECENTRIC)}
-"""Every projection by its name."""
 
 
-def projection_named(name: object, what: str = "projection") -> Projection:
-    """Return a projection by its name.
-
-    Raises
-    ------
-    InputError
-        If there is none of that name.
-    """
+def projection_named(name: object, field: str = "projection") -> Projection:
+    """Return the projection of a name."""
     if not isinstance(name, str) or name not in PROJECTIONS:
-        raise InputError(f"expected one of {', '.join(PROJECTIONS)}, got {name!r}", field=what)
+        raise InputError(f"expected one of {', '.join(PROJECTIONS)}, got {name!r}", field=field)
     return PROJECTIONS[name]
-
-
-LARGEST_IMAGE = 100_000  # px
-EVENLY = 33  # pixels along either edge that stand for an image
 
 
 @dataclass(frozen=True)
 class Plane:
-    """The plane normal . x = offset.
-
-    Parameters
-    ----------
-    normal : (3,) unit vector, world frame
-    offset : mm
-    """
+    """The plane normal . x = offset (mm), its normal (3,) a unit vector in the world frame."""
 
     normal: Float[Tensor, 3]
     offset: float
@@ -263,7 +227,7 @@ class Plane:
 
 @dataclass(frozen=True)
 class Camera:
-    """A calibrated camera, and the background it looks at if there is one.
+    """A calibrated camera and the background it looks at.
 
     Parameters
     ----------
@@ -271,18 +235,12 @@ class Camera:
     rotation : (3, 3) world to camera
     translation : (3,) world to camera, mm
     image_size : (height, width), px
-    background : Plane of any orientation, world frame, mm; None for a technique that needs none
-    distortion : (5,) OpenCV's k1, k2, p1, p2, k3; of a telecentric camera of (x, y) in mm
-    name : what the view is called
-    projection : perspective or telecentric
-    lens : Lens whose whole disc a pixel sees through; None for a thin ray a pixel
-    pose_sigma : (6,) standard deviations of its turn about its own axes (rad) and of the shift of its centre along them
-        (mm); None where they are not known
-
-    Raises
-    ------
-    InputError
-        If the rotation is not one, or another number cannot be that of a camera.
+    background : Plane of any orientation, world frame, mm; None for a technique without one
+    distortion : (5,) OpenCV's k1, k2, p1, p2, k3; of a telecentric camera for (x, y) in mm
+    name : of the view
+    lens : the aperture through which a pixel sees; None for one thin ray per pixel
+    pose_sigma : (6,) standard deviations of the rotation about its own axes (rad) and of the shift of its centre along
+        them (mm), or None
     """
 
     intrinsics: Matrix3
@@ -297,120 +255,87 @@ class Camera:
     pose_sigma: Float[Tensor, 6] | None = None
 
     def __post_init__(self) -> None:
-        plane = self.background
-        offset = 0.0 if plane is None else plane.offset
-        for what, value, most, unit in (
-            ("intrinsics", self.intrinsics, 1e7, "px"),
-            ("translation", self.translation, LARGEST_LENGTH, "mm"),
-            ("distortion", self.distortion, 1e6, ""),
-            ("background_offset", torch.tensor(offset), LARGEST_LENGTH, "mm"),
-        ):
-            if not bool((value.abs() <= most).all()):
-                got = value.tolist()
-                raise InputError(
-                    f"{what} of view '{self.name}': expected numbers up to {most:g} {unit}".rstrip() + f", got {got}"
-                )
-        if plane is not None and not abs(float(plane.normal.norm()) - 1) < 1e-2:
-            raise InputError(
-                f"expected a unit vector, got {plane.normal.tolist()}", field=f"background_normal of view '{self.name}'"
-            )
-        r = self.rotation
-        error = float((r @ r.T - torch.eye(3, dtype=r.dtype)).abs().max())
-        determinant = float(torch.linalg.det(r))
-        if not (error < 1e-4 and determinant > 0):
-            raise InputError(
-                f"expected a rotation matrix (R R^T = 1, det = +1), "
-                f"got |R R^T - 1| = {error:.2g}, det = {determinant:.3g}; check for a swapped or mirrored axis",
-                field=f"rotation of view '{self.name}'",
-            )
-        k = self.intrinsics
-        if not min(float(k[0, 0]), float(k[1, 1])) >= self.projection.least_scale:
-            raise InputError(
-                f"expected positive {self.projection.scale}s in "
-                f"{self.projection.unit}, got fx = {float(k[0, 0]):.6g}, fy = {float(k[1, 1]):.6g}",
-                field=f"intrinsics of view '{self.name}'",
-            )
-        if abs(float(k[2, 2]) - 1) > 1e-9 or float(k[2, :2].abs().max()) > 0 or float(k[1, 0]) != 0:
-            raise InputError(
-                "expected K = [[fx, s, cx], [0, fy, cy], [0, 0, 1]]; a transposed K (MATLAB) has to be transposed back",
-                field=f"intrinsics of view '{self.name}'",
-            )
-        if not (min(self.image_size) > 0 and max(self.image_size) <= LARGEST_IMAGE):
-            raise InputError(
-                f"expected (height, width) between 1 and {LARGEST_IMAGE} px, got {self.image_size}",
-                field=f"image_size of view '{self.name}'",
-            )
-        if self.pose_sigma is not None and not bool(((self.pose_sigma >= 0) & (self.pose_sigma < torch.inf)).all()):
-            raise InputError(
-                f"expected standard deviations of 0 or more, got {self.pose_sigma.tolist()}",
-                field=f"pose_sigma of view '{self.name}'",
-            )
-        if self.lens is not None and self.lens.diameter > 0:
-            self._check_focus(self.lens)
+        def check(name: str, valid: bool, expected: str, got: object, remedy: str = "") -> None:
+            if not valid:
+                raise InputError(f"expected {expected}, got {got}{remedy}", field=f"{name} of view '{self.name}'")
 
-    def _check_focus(self, lens: Lens) -> None:
-        """Refuse a lens of which it is not known where it is in focus, or that is in focus where it is."""
-        if lens.focus is None and self.background is None:
-            raise InputError(
-                f"expected mm along the optical axis for a lens of "
-                f"{lens.diameter:g} mm that looks at no background, got none",
-                field=f"focus_distance of view '{self.name}'",
-            )
-        depth = self.depth(self.plane) if lens.focus is None else lens.focus
-        if not (depth > 0 or (depth < 0 and not self.projection.shows_depth)):
-            raise InputError(
-                f"expected a lens in focus before the camera, got a depth of "
-                f"{depth:g} mm; check background_offset, or give the distance",
-                field=f"focus_distance of view '{self.name}'",
+        plane, lens, kind, k, r = self.background, self.lens, self.projection, self.intrinsics, self.rotation
+        for name, value, limit, unit in (
+            ("intrinsics", k, 1e7, " px"),
+            ("translation", self.translation, LARGEST_LENGTH, " mm"),
+            ("distortion", self.distortion, 1e6, ""),
+            ("background_offset", torch.tensor(0.0 if plane is None else plane.offset), LARGEST_LENGTH, " mm"),
+        ):
+            check(name, bool((value.abs() <= limit).all()), f"numbers up to {limit:g}{unit}", value.tolist())
+        if plane is not None:
+            unit_length = abs(float(plane.normal.norm()) - 1) < 1e-2
+            check("background_normal", unit_length, "a unit vector", plane.normal.tolist())
+        error, determinant = float((r @ r.T - torch.eye(3, dtype=r.dtype)).abs().max()), float(torch.linalg.det(r))
+        check(
+            "rotation", error < 1e-4 and determinant > 0, "a rotation matrix (R R^T = 1, det = +1)",
+            f"|R R^T - 1| = {error:.2g}, det = {determinant:.3g}", "; check for a swapped or mirrored axis",
+        )  # fmt: skip
+        fx, fy = float(k[0, 0]), float(k[1, 1])
+        positive = min(fx, fy) >= kind.least_scale
+        check("intrinsics", positive, f"positive {kind.scale}s in {kind.unit}", f"fx = {fx:.6g}, fy = {fy:.6g}")
+        upper = abs(float(k[2, 2]) - 1) <= 1e-9 and not float(k[2, :2].abs().max()) and not float(k[1, 0])
+        remedy = "; a transposed K (MATLAB) has to be transposed back"
+        check("intrinsics", upper, "K = [[fx, s, cx], [0, fy, cy], [0, 0, 1]]", k.tolist(), remedy)
+        valid = min(self.image_size) > 0 and max(self.image_size) <= MAX_IMAGE_EDGE
+        check("image_size", valid, f"(height, width) between 1 and {MAX_IMAGE_EDGE} px", self.image_size)
+        if (sigma := self.pose_sigma) is not None:
+            valid = bool(((sigma >= 0) & (sigma < torch.inf)).all())
+            check("pose_sigma", valid, "standard deviations of 0 or more", sigma.tolist())
+        if lens is not None and lens.diameter > 0:
+            named = lens.focus is not None or plane is not None
+            check("focus_distance", named, f"mm for a lens of {lens.diameter:g} mm without a background", "none")
+            depth = self.depth(self.plane) if lens.focus is None else lens.focus
+            valid = depth > 0 or (depth < 0 and not kind.shows_depth)
+            remedy = "; check background_offset, or give the distance"
+            check(
+                "focus_distance", valid, "a plane in focus in front of the camera", f"a depth of {depth:g} mm", remedy
             )
 
     @property
     def centre(self) -> Float[Tensor, 3]:
-        """Origin of the camera's frame, mm, world frame: the optical centre of a perspective camera."""
+        """Origin of the camera's frame, mm, world frame; of a perspective camera its optical centre."""
         return -self.rotation.T @ self.translation
 
     def local(self, points: Points) -> Points:
-        """World points (mm) in the camera's frame, mm."""
+        """Return world points (mm) in the camera's frame, mm."""
         return points @ self.rotation.T + self.translation
 
     def sight(self, points: Points) -> Points:
-        """Unit directions in which the camera sees world points (mm), away from it, world frame."""
+        """Return the unit directions of the lines of sight through world points (mm), away from the camera."""
         return self.projection.sight(self.local(points)) @ self.rotation
 
     def distance(self, points: Points) -> Values:
-        """How far the camera is from world points (mm), mm: infinitely far where its lines of sight are parallel."""
+        """Return the distances of world points (mm) from the camera, mm; infinity for a telecentric camera."""
         return self.projection.distance(self.local(points))
 
     def pixel_size(self, points: Points) -> Values:
-        """Width of a pixel, mm, at world points (mm), across the optical axis."""
+        """Return the width of a pixel at world points (mm), across the optical axis, mm."""
         return 1 / (self.intrinsics[0, 0] * self.projection.magnification(self.local(points)))
 
     @property
     def plane(self) -> Plane:
-        """The background.
-
-        Raises
-        ------
-        InputError
-            If the camera has none.
-        """
+        """The background, which has to be there."""
         if self.background is None:
-            raise InputError(
-                "expected a plane, normal . x = offset, got none", field=f"background of view '{self.name}'"
-            )
+            name = f"background of view '{self.name}'"
+            raise InputError("expected a plane, normal . x = offset, got none", field=name)
         return self.background
 
     def pixel_grid(self) -> Float[Tensor, "row column 2"]:
-        """All pixel centres, px."""
+        """Return all pixel centres, px."""
         height, width = self.image_size
         v, u = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
         return torch.stack([u, v], dim=-1).to(self.intrinsics.dtype)
 
     @property
     def unseen(self) -> float:
-        """Share of the image for which the distortion cannot be inverted, by EVENLY x EVENLY of its pixels."""
+        """Fraction of the image in which the distortion cannot be inverted, from LATTICE x LATTICE of its pixels."""
         height, width = self.image_size
-        u, v = (torch.linspace(0, n - 1, min(n, EVENLY), dtype=torch.float64) for n in (width, height))
+        u, v = (torch.linspace(0, n - 1, min(n, LATTICE), dtype=torch.float64) for n in (width, height))
         rays = self.rays(torch.cartesian_prod(u, v).reshape(-1, 2), sensitivity=False)
         return 1 - float((rays.origin + rays.direction).isfinite().all(dim=-1).double().mean())
 
@@ -424,18 +349,18 @@ class Camera:
             )
 
     def project(self, points: Points) -> Pixels:
-        """Project world points (mm) to pixels (px); NaN where the distortion folds the image back."""
+        """Return the pixels (px) of world points (mm); NaN beyond the fold of the distortion."""
         return self._project_jacobian(points)[0]
 
     def rays(self, pixels: Float[Tensor, "n 2"], sensitivity: bool = True, view: int = 0) -> Rays:
-        """Back-trace the rays seen by `pixels` (px), to the background where there is one; not yet clipped to a box.
+        """Return the rays of `pixels` (px), back-traced to the background; not yet clipped to a box.
 
-        A pixel for which the distortion cannot be inverted has a ray of NaN, which crosses no box.
+        A pixel at which the distortion cannot be inverted has a ray of NaN, which crosses no box.
 
         Parameters
         ----------
-        sensitivity : whether S = -d project / d X at the background point X0 is wanted (S . direction = 0), else 0
-        view : number of the view, kept with the rays
+        sensitivity : whether to compute S = -d project / d X at the background point X0 (S . direction = 0), else 0
+        view : index of the view, stored with the rays
         """
         k = self.intrinsics
         y = (pixels[..., 1] - k[1, 2]) / k[1, 1]
@@ -453,17 +378,17 @@ class Camera:
         return Rays(origin, direction, zero, zero, pixels, number, begin, ends, lens)
 
     def depth(self, plane: Plane) -> float:
-        """Return where the optical axis meets a plane, mm from z_cam = 0."""
+        """Return the depth at which the optical axis meets a plane, mm from z_cam = 0."""
         normal = plane.normal.to(self.rotation)
         return float(plane.offset - self.centre @ normal) / float(self.rotation[2] @ normal)
 
-    def stopped_down(self, pixel_pitch: float, f_number: float) -> Camera:
-        """Return the camera with a lens that is focused on its background.
+    def with_f_number(self, pixel_pitch: float, f_number: float) -> Camera:
+        """Return the camera with a lens of this f-number that is focused on its background; 0 for thin rays.
 
         Parameters
         ----------
         pixel_pitch : of its sensor, mm
-        f_number : focal length over aperture; of a telecentric lens that on the sensor's side; 0 for thin rays
+        f_number : focal length over aperture; of a telecentric lens on the side of the sensor
         """
         if not f_number >= 0:
             raise InputError(f"expected above 0, or 0 for thin rays, got {f_number}", field="f_number")
@@ -475,7 +400,7 @@ class Camera:
 
     @property
     def without_background(self) -> Camera:
-        """The camera that looks at none, in focus where it was."""
+        """The camera without its background, with the same plane in focus."""
         lens = self.lens
         if lens is not None and lens.diameter > 0 and lens.focus is None:
             lens = replace(lens, focus=self.depth(self.plane))
@@ -483,11 +408,10 @@ class Camera:
 
     @property
     def without_window(self) -> Camera:
-        """The camera of which every pixel measures by itself."""
+        """The camera whose pixels measure at a point, not the mean over a window."""
         return self if self.lens is None else replace(self, lens=replace(self.lens, window=0.0))
 
     def _lens_discs(self, direction: Points, ends: BackgroundPoints | None) -> LensDiscs | None:
-        """The lens as rays see it."""
         if self.lens is None:
             return None
         axis = self.rotation[2].to(direction)
@@ -495,7 +419,7 @@ class Camera:
             focus = self.lens.focus / (direction @ axis)
         elif ends is not None:
             focus = ends.distance
-        else:  # a thin ray beside others that are none
+        else:  # a thin ray among others that are not
             focus = torch.full_like(direction[..., 0], torch.inf)
         normal = axis if self.background is None else self.background.normal.to(direction)
         radius = torch.full_like(focus, self.lens.diameter / 2)
@@ -504,7 +428,6 @@ class Camera:
         return LensDiscs(axis.expand_as(direction), normal.expand_as(direction), radius, focus, window, parallel)
 
     def _background_points(self, origin: Points, direction: Points, sensitivity: bool) -> BackgroundPoints | None:
-        """Where rays meet the background, and S there."""
         if self.background is None:
             return None
         normal = self.background.normal.to(direction)
@@ -514,7 +437,7 @@ class Camera:
         return BackgroundPoints(-self._project_jacobian(origin + distance[..., None] * direction)[1], distance)
 
     def view(self, row: int, column: int, height: int, width: int) -> Camera:
-        """Return the camera of a crop of its image that starts at (row, column), px."""
+        """Return the camera of a crop of its image from (row, column), px."""
         shift = torch.zeros_like(self.intrinsics)
         shift[0, 2], shift[1, 2] = column, row
         return replace(self, intrinsics=self.intrinsics - shift, image_size=(height, width))
@@ -524,8 +447,8 @@ class Camera:
         local = self.local(points)
         image, slope = self.projection.image(local), self.projection.slope
         folded = image.norm(dim=-1, keepdim=True) > fold(self.distortion)
-        seen = image.masked_fill(folded, torch.nan)
-        x, y, (xx, cross, yy) = distort(seen[..., 0], seen[..., 1], self.distortion)
+        valid = image.masked_fill(folded, torch.nan)
+        x, y, (xx, cross, yy) = distort(valid[..., 0], valid[..., 1], self.distortion)
         k = self.intrinsics
         pixels = torch.stack([k[0, 0] * x + k[0, 1] * y + k[0, 2], k[1, 1] * y + k[1, 2]], dim=-1)
         # row by row: small matrix products are slow in a batch

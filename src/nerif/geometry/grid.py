@@ -1,7 +1,4 @@
-"""The box under study and the voxel grid laid into it.
-
-A volume is indexed [z, y, x] and its values stand at voxel centres.
-"""
+"""The box to reconstruct and its voxel grid: volumes are indexed [z, y, x], with values at voxel centres."""
 
 from __future__ import annotations
 
@@ -15,22 +12,12 @@ from nerif.common.conventions import FACES, LARGEST_LENGTH, InputError
 
 __all__ = ["Box", "Grid"]
 
-SHORTEST_EDGE = 1e-5  # of the largest coordinate: voxels are told apart in single precision
+MIN_EDGE = 1e-5  # over the largest coordinate: voxels have to differ in single precision
 
 
 @dataclass(frozen=True)
 class Box:
-    """An axis-aligned volume of interest.
-
-    Parameters
-    ----------
-    lower, upper : (x, y, z) corners, mm, world frame
-
-    Raises
-    ------
-    InputError
-        If an edge is not longer than zero, or a corner is not finite or beyond ten kilometres.
-    """
+    """An axis-aligned box with corners (x, y, z) `lower` and `upper`, mm, world frame, at most ten kilometres away."""
 
     lower: tuple[float, float, float]
     upper: tuple[float, float, float]
@@ -39,10 +26,9 @@ class Box:
         if not len(self.lower) == len(self.upper) == 3:
             raise InputError(f"expected corners (x, y, z) in mm, got {self.lower} to {self.upper}", field="box")
         largest = max(abs(c) for c in (*self.lower, *self.upper))
-        if not (largest <= LARGEST_LENGTH and all(e > SHORTEST_EDGE * largest for e in self.edges)):
-            raise InputError(
-                f"expected lower < upper along x, y and z (mm), got {self.lower} to {self.upper}", field="box"
-            )
+        if not (largest <= LARGEST_LENGTH and all(e > MIN_EDGE * largest for e in self.edges)):
+            got = f"{self.lower} to {self.upper}"
+            raise InputError(f"expected lower < upper along x, y and z (mm), got {got}", field="box")
 
     @classmethod
     def cube(cls, edge: float) -> Box:
@@ -57,13 +43,7 @@ class Box:
 
     @classmethod
     def between(cls, lower: tuple[float, float, float] | None, upper: tuple[float, float, float] | None) -> Box | None:
-        """Return the box between two corners (mm) that may be left out, together: None then.
-
-        Raises
-        ------
-        InputError
-            If one of them is there and the other is not.
-        """
+        """Return the box between two corners (mm), None without them; one alone is refused."""
         if (lower is None) != (upper is None):
             raise InputError("expected both corners of the box or neither", field="lower, upper")
         return None if lower is None or upper is None else cls(lower, upper)
@@ -81,7 +61,7 @@ class Box:
         return (x, y, z)
 
     def holds(self, other: Box) -> bool:
-        """Whether another box lies within this one, to a nanometre."""
+        """Return whether another box lies within this one, to a nanometre."""
         pairs = (*zip(self.lower, other.lower, strict=True), *zip(other.upper, self.upper, strict=True))
         return all(a <= b + 1e-6 for a, b in pairs)
 
@@ -96,13 +76,7 @@ class Box:
 
 @dataclass(frozen=True)
 class Grid:
-    """Voxels filling a box.
-
-    Parameters
-    ----------
-    box : Box, mm
-    shape : (nz, ny, nx) number of voxels along z, y, x
-    """
+    """Voxels filling a box (mm), `shape` (nz, ny, nx) of them along z, y, x."""
 
     box: Box
     shape: tuple[int, int, int]
@@ -113,13 +87,7 @@ class Grid:
 
     @classmethod
     def of_resolution(cls, box: Box, voxels: int) -> Grid:
-        """Return near-cubic voxels, `voxels` of them along the longest edge of the box.
-
-        Raises
-        ------
-        InputError
-            If that is less than one.
-        """
+        """Return the grid of near-cubic voxels with `voxels` of them along the longest edge of the box."""
         if not voxels >= 1:
             raise InputError(f"expected at least 1 along the longest edge, got {voxels}", field="voxels")
         size = max(box.edges) / voxels
@@ -134,12 +102,12 @@ class Grid:
         return (ex / nx, ey / ny, ez / nz)
 
     def axis(self, name: str, dtype: torch.dtype = torch.float64) -> Float[Tensor, " n"]:
-        """Voxel-centre coordinates along ``"x"``, ``"y"`` or ``"z"``, mm."""
+        """Return voxel-centre coordinates along ``"x"``, ``"y"`` or ``"z"``, mm."""
         i = "xyz".index(name)
         n = self.shape[2 - i]
         return self.box.lower[i] + (torch.arange(n, dtype=dtype) + 0.5) * self.spacing[i]
 
     def points(self, dtype: torch.dtype = torch.float32) -> Float[Tensor, "z y x 3"]:
-        """Voxel centres, mm."""
+        """Return voxel centres, mm."""
         z, y, x = torch.meshgrid(self.axis("z"), self.axis("y"), self.axis("x"), indexing="ij")
         return torch.stack([x, y, z], dim=-1).to(dtype)

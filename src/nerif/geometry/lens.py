@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from nerif.common.conventions import LARGEST_LENGTH, InputError
+from nerif.common.conventions import LARGEST_LENGTH, InputError, check_positive
 from nerif.geometry.grid import Box
 
 __all__ = ["Columns", "Lens", "LensDiscs", "spread_points"]
@@ -25,14 +25,14 @@ C = TypeVar("C", bound="Columns")
 
 
 class Columns:
-    """A record of arrays with one entry a ray, or of such records; None where there is nothing."""
+    """A record of arrays with one entry per ray, or of such records; None for an absent one."""
 
     def each(self: C, change: Callable[..., Tensor], *others: C) -> C:
-        """Return the record of what `change` makes of every array and those of the others in its place.
+        """Return the record of change(array, the arrays of `others` in its place) for all arrays.
 
-        What is no array, such as a box, is the same in all of them.
+        Other fields, such as a box, have to be the same in all records.
         """
-        made: dict[str, Any] = {}
+        columns: dict[str, Any] = {}
         for f in fields(self):  # type: ignore[arg-type]
             first, *more = (getattr(part, f.name) for part in (self, *others))
             if isinstance(first, Columns):
@@ -41,36 +41,31 @@ class Columns:
                 first = change(first, *more)
             else:
                 assert all(other == first for other in more), f"{f.name}: expected the same in all records"
-            made[f.name] = first
-        return type(self)(**made)
+            columns[f.name] = first
+        return type(self)(**columns)
 
 
-CHEBYSHEV = (-0.7946544723, -0.1875924741, 0.1875924741, 0.7946544723)  # of -1 to 1, all of one weight
-MIXED = 3
-LARGEST_WINDOW = 1000  # px
-SEED = 20  # of points that have to be the same every time
-MANY = 8  # points, from which on they stand on two rings
+CHEBYSHEV = (-0.7946544723, -0.1875924741, 0.1875924741, 0.7946544723)  # equal-weight quadrature on -1 to 1
+SHUFFLE = 3  # stride through the points of the window, so that neighbours on the disc are not neighbours in it
+MAX_WINDOW = 1000  # px
+SEED = 20  # of points that are the same in each call
+TWO_RINGS = 8  # number of points from which they are placed on two rings
 RINGS = (0.5,), (0.5 - 0.5 / math.sqrt(3), 0.5 + 0.5 / math.sqrt(3))  # squares of their radii
-PLASTIC = 1.324717957244746  # the root of x^3 = x + 1, of the most even lattice in a square
+PLASTIC = 1.324717957244746  # root of x^3 = x + 1, which gives the most even lattice in a square
 
 
 @dataclass(frozen=True)
 class Lens:
-    """What a pixel gathers: the light of a thin lens of finite aperture, the mean over a window of pixels.
+    """The aperture and window of a pixel: a thin lens, and the square of pixels over which a displacement is the mean.
 
     Parameters
     ----------
     diameter : of the entrance pupil (focal length / f-number) or, of a telecentric lens, of the cone of rays to a point
-        in focus where it passes z_cam = 0; mm; 0 for a thin ray a pixel
-    focus : depth of the plane in focus along the optical axis, mm, below 0 only of a telecentric lens; None for the
-        background's
-    points : number of points on the disc, where images are rendered and measurements simulated
-    window : edge of the square of pixels over which a displacement is the mean, px; 0 for that of its own pixel
-
-    Raises
-    ------
-    InputError
-        If one of them cannot be.
+        in focus at z_cam = 0; mm; 0 for thin rays
+    focus : depth of the plane in focus along the optical axis, mm, negative only for a telecentric lens; None: the
+        background
+    points : number of points on the disc for rendered images and simulated measurements
+    window : edge of the square, px; 0 for a displacement at the pixel
     """
 
     diameter: float = 0.0
@@ -80,26 +75,19 @@ class Lens:
 
     def __post_init__(self) -> None:
         if not 0 <= self.diameter <= LARGEST_LENGTH:
-            raise InputError(f"expected a lens of 0 mm or more, got {self.diameter}", field="aperture_diameter")
+            raise InputError(f"expected 0 mm or more, got {self.diameter}", field="aperture_diameter")
         if self.focus is not None and not 0 < abs(self.focus) <= LARGEST_LENGTH:
-            raise InputError(
-                f"expected a lens in focus elsewhere than at 0 mm, got {self.focus}", field="focus_distance"
-            )
-        if self.points < 1:
-            raise InputError(f"expected at least one point on the lens, got {self.points}", field="points")
-        if not 0 <= self.window <= LARGEST_WINDOW:
-            raise InputError(f"expected an edge of 0 to {LARGEST_WINDOW} px, got {self.window}", field="window")
+            raise InputError(f"expected a distance other than 0 mm, got {self.focus}", field="focus_distance")
+        check_positive(self, "points")
+        check_positive(self, "window", zero=True, limit=MAX_WINDOW)
 
     @property
     def wide(self) -> bool:
-        """Whether a pixel gathers more than a thin ray."""
+        """Whether a pixel has more than one thin ray."""
         return self.diameter > 0 or self.window > 0
 
     def offsets(self) -> Float[Tensor, "n 4"]:
-        """Return points spread evenly over disc (sunflower spiral) and window, in shares of radius and half an edge.
-
-        There is one for a thin ray.
-        """
+        """Return points of disc (sunflower spiral) and window, over radius and half edge; one for a thin ray."""
         if not self.wide:
             return torch.zeros(1, 4, dtype=torch.float64)
         i = torch.arange(self.points, dtype=torch.float64)
@@ -110,17 +98,17 @@ class Lens:
 
 @dataclass(frozen=True)
 class LensDiscs(Columns):
-    """The disc of the lens that each ray passes in the middle, and the window of pixels about its own.
+    """The disc of the lens about each ray, and the window about its pixel.
 
     Parameters
     ----------
-    axis : (n, 3) unit vector of the optical axis, which the disc stands across
-    normal : (n, 3) unit vector of the background's normal; the axis where there is none
+    axis : (n, 3) unit vector of the optical axis, normal to the disc
+    normal : (n, 3) unit normal of the background; the axis without one
     radius : (n,) mm
     focus : (n,) path length from the ray's origin to the point in focus, mm
     window : (n,) half the edge of the window, px
-    parallel : (n,) whether rays of other pixels start elsewhere in the same direction, or at the same place in another
-    box : what rays through other points of the disc are clipped to, or None
+    parallel : (n,) whether rays of other pixels are parallel to this one, or have the same origin
+    box : to which rays through other points of the disc are clipped, or None
     """
 
     axis: Float[Tensor, "n 3"]
@@ -134,13 +122,13 @@ class LensDiscs(Columns):
     def shifts(
         self, square: Float[Tensor, "n k 2"], sensitivity: Float[Tensor, "n 2 3"], direction: Float[Tensor, "n 3"]
     ) -> Float[Tensor, "n k 3"]:
-        """Return how far on the background (mm) other pixels of the window see than that in its middle.
+        """Return the shifts on the background (mm) of the ends of other pixels of the window.
 
             X' = X - S^+ p + t (n . S^+ p) / (n . t),      S^+ = S^T (S S^T)^-1
 
         Parameters
         ----------
-        square : pixels of the window, in shares of half its edge
+        square : pixels of the window, over half its edge
         sensitivity : S, px/mm
         direction : t of the rays
         """
@@ -153,50 +141,43 @@ class LensDiscs(Columns):
         return across - off[..., None] * direction[:, None]
 
     def points(self, disc: Float[Tensor, "n k 2"]) -> Float[Tensor, "n k 3"]:
-        """Return how far from its middle points of the disc are (mm), given in shares of its radius."""
-        # across the axis, by the coordinate that the axis has least of
-        least = torch.nn.functional.one_hot(self.axis.abs().argmin(dim=-1), 3).to(self.axis)
-        first = torch.nn.functional.normalize(torch.linalg.cross(self.axis, least), dim=-1)
+        """Return points of the disc, given over its radius, relative to its centre, mm."""
+        # across the axis, from the coordinate axis furthest from it
+        other = torch.nn.functional.one_hot(self.axis.abs().argmin(dim=-1), 3).to(self.axis)
+        first = torch.nn.functional.normalize(torch.linalg.cross(self.axis, other), dim=-1)
         second = torch.linalg.cross(self.axis, first)
         x, y = (self.radius[:, None] * disc.to(self.axis).unbind(-1)[i] for i in (0, 1))
         return x[..., None] * first[:, None] + y[..., None] * second[:, None]
 
 
 def spread_points(rays: int, count: int, generator: torch.Generator | None = None) -> Float[Tensor, "n k 4"]:
-    """Return points of the unit disc and of the square about 0 of edge 2 for each ray, evenly over both.
+    """Return points of the unit disc and of the square [-1, 1]^2 for each ray, evenly over both.
 
     Parameters
     ----------
     count : even, or 1 for the middle
-    generator : turns and moves them; None for the same points every time
+    generator : of a random rotation and shift; None: the same points in each call
     """
     if count == 1:
         return torch.zeros(rays, 1, 4)
     generator = generator or torch.Generator().manual_seed(SEED)
-    disc = disc_points(rays, count, generator)
+    disc = _disc(rays, count, generator)
     return torch.cat([disc, _square(torch.rand(rays, 1, 2, generator=generator), count)], dim=-1)
 
 
-def disc_points(rays: int, count: int, generator: torch.Generator | None = None) -> Float[Tensor, "n k 2"]:
-    """Return points of the unit disc for each ray whose mean is that over the disc, turned at random.
+def _disc(rays: int, count: int, generator: torch.Generator) -> Float[Tensor, "n k 2"]:
+    """Points of the unit disc whose mean approximates that over the disc, rotated at random for each ray.
 
-    They stand evenly on one ring, or from MANY on two: the mean of a polynomial is exact up to degree 3 in the radius,
-    or 7, and up to the number of points on a ring, less one, in the angle.
-
-    Parameters
-    ----------
-    count : even, or 1 for the middle
-    generator : turns them; None for the same points every time
+    They are evenly spaced on one ring, or on two from TWO_RINGS points on: exact for polynomials up to degree 3 or 7 in
+    the radius, and up to the number of points on a ring, less one, in the angle.
 
     Source: Gauss-Legendre quadrature in the square of the radius; Stroud, Approximate Calculation of Multiple Integrals
     (1971), S2.
     """
-    if count == 1:
-        return torch.zeros(rays, 1, 2)
-    assert count % 2 == 0, "so many points stand on rings"
-    rings = RINGS[count >= MANY]
+    assert count % 2 == 0, "expected an even number of points"
+    rings = RINGS[count >= TWO_RINGS]
     on_ring = count // len(rings)
-    turn = torch.rand(rays, 1, 1, generator=generator or torch.Generator().manual_seed(SEED))
+    turn = torch.rand(rays, 1, 1, generator=generator)
     share = torch.arange(on_ring) / on_ring + torch.arange(len(rings))[:, None] / (len(rings) * on_ring)
     angle = 2 * math.pi * (turn + share)
     radius = torch.tensor(rings).sqrt()[:, None]
@@ -204,16 +185,16 @@ def disc_points(rays: int, count: int, generator: torch.Generator | None = None)
 
 
 def _square(start: Float[Tensor, "n 1 2"], count: int) -> Float[Tensor, "n k 2"]:
-    """Points of the square about 0 of edge 2, for a mean over it.
+    """Points of the square [-1, 1]^2, for a mean over it.
 
-    16 are 4 x 4, exact up to degree 5; others a lattice that begins at `start`, folded by the tent function.
+    16 are 4 x 4, exact up to degree 5; others a lattice from `start`, folded by the tent function.
 
     Source: Chebyshev's quadrature; Hickernell, Obtaining O(N^-2+eps) convergence for lattice quadrature rules (2002).
     """
     if count == len(CHEBYSHEV) ** 2:
         row = torch.tensor(CHEBYSHEV)
-        mixed = torch.arange(count) * MIXED % count  # neighbours on the disc are none in the window
-        return torch.cartesian_prod(row, row)[mixed].expand(len(start), -1, -1)
+        order = torch.arange(count) * SHUFFLE % count
+        return torch.cartesian_prod(row, row)[order].expand(len(start), -1, -1)
     i = torch.arange(count)[:, None]
     lattice = (start + i * torch.tensor([1 / PLASTIC, 1 / PLASTIC**2])) % 1
     return 1 - 2 * (2 * lattice - 1).abs()

@@ -1,7 +1,7 @@
-"""Can a rig be as its calibration says? Cameras outside the box, rays through it, backgrounds behind it, sizes in mm.
+"""Plausibility of a rig: cameras outside the box, rays through it, backgrounds behind it, sizes in mm.
 
-Where it cannot, errors that are common in calibrations (UNITS_AND_POSES) are undone one at a time; the first that makes
-the rig a possible one is the likely cause.
+For an implausible rig, common errors of calibrations (UNITS_AND_POSES) are undone one at a time; the first that makes
+the rig plausible is the likely cause.
 """
 
 from __future__ import annotations
@@ -21,30 +21,24 @@ from nerif.geometry.rays import Rays
 
 __all__ = ["Suspect", "background_cuts", "likely_cause", "rays_on_lattice", "rig_findings", "suspects"]
 
-LEAST, MOST = 1.0, 1e4  # mm, of the longest edge of a box that is plausible
-ACROSS, ALONG = 33, 65  # pixels along an edge of an image that are traced, and points along each of their rays
-COARSE = 9  # the same pixels where the points along their rays are projected into the other images
-BESIDE = 0.1  # of the rays that cross the box, and of the box that is in the image: below both a camera looks past it
-MARGIN = 0.1  # of the image that a point may be outside and still count as seen by two views
+MIN_EDGE, MAX_EDGE = 1.0, 1e4  # mm, of the longest edge of a box
+PIXELS, COARSE_PIXELS = 33, 9  # along an edge of an image that are traced, alone and for a comparison of views
+RAY_POINTS = 65  # along a ray
+BOX_POINTS = 9  # along an edge of the box
+MIN_OVERLAP = 0.1  # of rays with the box, and of the box with the image: a camera with less of both looks past it
+MARGIN = 0.1  # around an image, over its size, in which a point counts as visible to two views
 
 
 @dataclass(frozen=True)
 class Suspect:
-    """An error that may be in a calibration.
-
-    Parameters
-    ----------
-    words : what it is
-    undo : gives the camera without it
-    undo_box : gives the box without it
-    """
+    """A possible error of a calibration, and the camera and the box without it."""
 
     words: str
     undo: Callable[[Camera], Camera] = lambda camera: camera
     undo_box: Callable[[Box], Box] = lambda box: box
 
 
-def _moved(camera: Camera, factor: float, background: float = 1.0) -> Camera:
+def _scaled(camera: Camera, factor: float, background: float = 1.0) -> Camera:
     plane = camera.background
     plane = None if plane is None else Plane(plane.normal, background * plane.offset)
     return replace(camera, translation=factor * camera.translation, background=plane)
@@ -60,7 +54,7 @@ def _of_opengl(camera: Camera) -> Camera:
     return replace(camera, rotation=axes[:, None] * camera.rotation, translation=axes * camera.translation)
 
 
-def _scaled(box: Box, factor: float) -> Box:
+def _scaled_box(box: Box, factor: float) -> Box:
     (a, b, c), (d, e, f) = box.lower, box.upper
     return Box((factor * a, factor * b, factor * c), (factor * d, factor * e, factor * f))
 
@@ -69,9 +63,9 @@ OPENGL = "axes of OpenGL or Blender (y up, z towards the camera), where y points
 CAMERA_TO_WORLD = "poses from camera to world, where rotation and translation map world to camera"
 
 UNITS_AND_POSES = (
-    Suspect("translation in metres, where mm are expected", lambda c: _moved(c, 1e3)),
-    Suspect("translation and background_offset in metres, where mm are expected", lambda c: _moved(c, 1e3, 1e3)),
-    Suspect("translation in centimetres, where mm are expected", lambda c: _moved(c, 10.0)),
+    Suspect("translation in metres, where mm are expected", lambda c: _scaled(c, 1e3)),
+    Suspect("translation and background_offset in metres, where mm are expected", lambda c: _scaled(c, 1e3, 1e3)),
+    Suspect("translation in centimetres, where mm are expected", lambda c: _scaled(c, 10.0)),
     Suspect(CAMERA_TO_WORLD, _inverse),
     Suspect(
         "translation holds the position of the camera C, where -R C is expected",
@@ -80,9 +74,9 @@ UNITS_AND_POSES = (
     Suspect("rotation is transposed (MATLAB)", lambda c: replace(c, rotation=c.rotation.T.contiguous())),
     Suspect(OPENGL, _of_opengl),
     Suspect(f"{CAMERA_TO_WORLD}; and {OPENGL}", lambda c: _of_opengl(_inverse(c))),
-    Suspect(f"{CAMERA_TO_WORLD}; and translation in metres", lambda c: _inverse(_moved(c, 1e3))),
-    Suspect("box in metres, where mm are expected", undo_box=lambda box: _scaled(box, 1e3)),
-    Suspect("box in micrometres, where mm are expected", undo_box=lambda box: _scaled(box, 1e-3)),
+    Suspect(f"{CAMERA_TO_WORLD}; and translation in metres", lambda c: _inverse(_scaled(c, 1e3))),
+    Suspect("box in metres, where mm are expected", undo_box=lambda box: _scaled_box(box, 1e3)),
+    Suspect("box in micrometres, where mm are expected", undo_box=lambda box: _scaled_box(box, 1e-3)),
 )
 """Errors of units and poses, the most common first."""
 
@@ -90,83 +84,79 @@ UNITS_AND_POSES = (
 def suspects(
     cameras: Sequence[Camera], box: Box, which: Sequence[int] | None = None
 ) -> list[tuple[Suspect, tuple[Camera, ...], Box]]:
-    """Return every suspect with the rig as it is without it, where that is a possible one.
+    """Return the errors without which the rig is plausible, each with the cameras and the box without it.
 
     Parameters
     ----------
-    which : numbers of the cameras that may have it; all by default
+    which : indices of the cameras that may have the error; all by default
     """
     which, possible = range(len(cameras)) if which is None else which, []
     for suspect in UNITS_AND_POSES:
         try:
-            undone = tuple(suspect.undo(c) if i in which else c for i, c in enumerate(cameras))
-            other = suspect.undo_box(box)
+            cameras_without = tuple(suspect.undo(c) if i in which else c for i, c in enumerate(cameras))
+            box_without = suspect.undo_box(box)
         except InputError:  # lengths beyond all limits
             continue
-        if all(_sound(undone[i], other) for i in which) and not _size(other):
-            possible.append((suspect, undone, other))
+        if all(_plausible(cameras_without[i], box_without) for i in which) and not _size(box_without):
+            possible.append((suspect, cameras_without, box_without))
     return possible
 
 
 def likely_cause(cameras: Sequence[Camera], box: Box, which: Sequence[int] | None = None) -> str:
-    """Return the words of the first suspect without which the rig is possible, or what to look at where none is."""
-    found = suspects(cameras, box, which)
-    return f"likely {found[0][0].words}" if found else "check units (mm), poses (world to camera) and names of views"
+    """Return the first error without which the rig is plausible, or what to check if there is none."""
+    causes = suspects(cameras, box, which)
+    return f"likely {causes[0][0].words}" if causes else "check units (mm), poses (world to camera) and names of views"
 
 
 def rig_findings(cameras: Sequence[Camera], box: Box) -> list[Finding]:
-    """Return what cannot be right in a rig, whatever the images show.
+    """Return the implausible properties of a rig, independent of the images."""
+    findings, total = [], len(cameras)
 
-    Parameters
-    ----------
-    cameras : one a view
-    box : Box, mm
-    """
-    found, total = [], len(cameras)
+    def report(code: str, indices: Sequence[int], text: str) -> None:
+        if indices:
+            names = tuple(cameras[i].name for i in indices)
+            findings.append(Finding(code, f"{Finding.subject(names, total)}: {text}", names))
+
     if size := _size(box):
         longest = max(box.edges)
-        found.append(Finding(size, f"the box is {longest:.3g} mm long: are its corners, and all of the rig, in mm?"))
+        findings.append(Finding(size, f"the box is {longest:.3g} mm long: are its corners, and all of the rig, in mm?"))
     inside = [i for i, camera in enumerate(cameras) if _inside(camera, box)]
     if inside:
-        names = tuple(cameras[i].name for i in inside)
         middle = torch.tensor(box.centre, dtype=torch.float64)
-        far = max(float((cameras[i].centre.to(middle) - middle).norm()) for i in inside)
-        what = f"inside the box, at most {far:.3g} mm from its middle; {likely_cause(cameras, box, inside)}"
-        found.append(Finding("inside", f"{Finding.subject(names, total)}: the camera is {what}", names))
+        distance = max(float((cameras[i].centre.to(middle) - middle).norm()) for i in inside)
+        cause = likely_cause(cameras, box, inside)
+        report("inside", inside, f"the camera is inside the box, at most {distance:.3g} mm from its middle; {cause}")
     beside = [i for i, camera in enumerate(cameras) if i not in inside and _looks_past(camera, box)]
     if beside:
-        names = tuple(cameras[i].name for i in beside)
-        what = f"the camera looks past the box; {likely_cause(cameras, box, beside)}"
-        found.append(Finding("beside", f"{Finding.subject(names, total)}: {what}", names))
+        report("beside", beside, f"the camera looks past the box; {likely_cause(cameras, box, beside)}")
     rest = [i for i in range(total) if i not in (*inside, *beside)]
-    alone = _without_company([cameras[i] for i in rest], box)
-    if alone:
-        names = tuple(cameras[rest[i]].name for i in alone)
-        what = "its rays pass beside those of all others inside the box; check poses, crops and names of views"
-        found.append(Finding("apart", f"{Finding.subject(names, total)}: {what}", names))
-    return found
+    alone = [rest[i] for i in _without_overlap([cameras[i] for i in rest], box)]
+    report(
+        "apart", alone, "its rays pass beside those of all others inside the box; check poses, crops and names of views"
+    )
+    return findings
 
 
-def rays_on_lattice(camera: Camera, box: Box, across: int = ACROSS) -> Rays:
-    """Return the rays of some pixels, evenly over the image, clipped to the box."""
-    u, v = (torch.linspace(0, n - 1, min(n, across), dtype=torch.float64) for n in reversed(camera.image_size))
+def rays_on_lattice(camera: Camera, box: Box, pixels: int = PIXELS) -> Rays:
+    """Return the rays of `pixels` x `pixels` pixels over the image, clipped to the box."""
+    u, v = (torch.linspace(0, n - 1, min(n, pixels), dtype=torch.float64) for n in reversed(camera.image_size))
     return camera.rays(torch.cartesian_prod(u, v).reshape(-1, 2), sensitivity=False).clip(box)
 
 
 def background_cuts(camera: Camera, box: Box, rays: Rays) -> bool:
-    """Whether the background is in front of the box or in it, as the rays that cross the box see it."""
+    """Return whether the background is in front of the box or in it, along the rays that cross the box."""
     through = rays[rays.crosses]
     if camera.background is None or not len(through):
         return False
     normal = camera.background.normal.to(torch.float64)
-    plane = _corners(box) @ normal - camera.background.offset
+    plane = _points(box, 2) @ normal - camera.background.offset
     sight = camera.sight((camera.background.offset * normal).to(camera.rotation))
     behind = -plane * float(sight.to(normal) @ normal)
     return float(behind.min()) <= 0 or not bool(through.unobstructed.all())
 
 
-def _sound(camera: Camera, box: Box) -> bool:
-    """Whether a camera is outside the box, near enough to look at it, and has its background behind it."""
+def _plausible(camera: Camera, box: Box) -> bool:
+    """Whether a camera is outside the box, looks at it, and has its background behind it."""
     if _inside(camera, box) or _looks_past(camera, box):
         return False
     rays = rays_on_lattice(camera, box)
@@ -174,42 +164,41 @@ def _sound(camera: Camera, box: Box) -> bool:
 
 
 def _size(box: Box) -> str:
-    """The code of a box that is too small or too large; nothing where it is plausible."""
+    """Code of a box that is too small or too large, else empty."""
     longest = max(box.edges)
-    return "small_box" if longest < LEAST else "large_box" if longest > MOST else ""
+    return "small_box" if longest < MIN_EDGE else "large_box" if longest > MAX_EDGE else ""
 
 
 def _inside(camera: Camera, box: Box) -> bool:
-    """Whether a camera that has a place is inside the box."""
+    """Whether a perspective camera is inside the box."""
     inside = zip(box.lower, camera.centre.tolist(), box.upper, strict=True)
     return camera.projection.shows_depth and all(low < x < high for low, x, high in inside)
 
 
 def _looks_past(camera: Camera, box: Box) -> bool:
-    """Whether hardly a ray crosses the box, and hardly any of the box is in the image."""
     crossing = float(rays_on_lattice(camera, box).crosses.double().mean())
-    return crossing < BESIDE and float(_in_image(camera, _points(box)).double().mean()) < BESIDE
+    return crossing < MIN_OVERLAP and float(_in_image(camera, _points(box)).double().mean()) < MIN_OVERLAP
 
 
 def _in_image(camera: Camera, points: Points, margin: float = 0.0) -> Bool[Tensor, "*batch"]:
-    """Which points a camera has in its image, or within that share of it outside."""
+    """Which points are in the image of a camera, or within a margin around it, over its size."""
     points = points.to(camera.rotation)
     size = torch.tensor(camera.image_size[::-1], dtype=points.dtype)
     beyond = 0.5 + (margin * size).clamp_min(1.0) * (margin > 0)
     pixel = camera.project(points)
-    seen = ((pixel >= -beyond) & (pixel <= size - 1 + beyond)).all(dim=-1)
-    return seen & (camera.local(points)[..., 2] > 0) if camera.projection.shows_depth else seen
+    inside = ((pixel >= -beyond) & (pixel <= size - 1 + beyond)).all(dim=-1)
+    return inside & (camera.local(points)[..., 2] > 0) if camera.projection.shows_depth else inside
 
 
-def _without_company(cameras: Sequence[Camera], box: Box) -> list[int]:
-    """Numbers of the cameras that see no part of the box that another one sees."""
+def _without_overlap(cameras: Sequence[Camera], box: Box) -> list[int]:
+    """Indices of the cameras that see no part of the box that another one sees."""
     if len(cameras) < 2:
         return []
     alone = []
     for i, camera in enumerate(cameras):
-        rays = rays_on_lattice(camera, box, COARSE)
+        rays = rays_on_lattice(camera, box, COARSE_PIXELS)
         rays = rays[rays.crosses]
-        share = torch.linspace(0, 1, ALONG, dtype=torch.float64)
+        share = torch.linspace(0, 1, RAY_POINTS, dtype=torch.float64)
         points = rays.at(rays.near[:, None] + share * (rays.far - rays.near)[:, None]).reshape(-1, 3)
         others = (other for j, other in enumerate(cameras) if j != i)
         if len(points) and not any(bool(_in_image(other, points, MARGIN).any()) for other in others):
@@ -217,15 +206,7 @@ def _without_company(cameras: Sequence[Camera], box: Box) -> list[int]:
     return alone
 
 
-def _points(box: Box) -> Float[Tensor, "n 3"]:
-    """Points all over a box, corners included, mm."""
-    axes = (
-        torch.linspace(low, high, COARSE, dtype=torch.float64) for low, high in zip(box.lower, box.upper, strict=True)
-    )
-    return torch.cartesian_prod(*axes)
-
-
-def _corners(box: Box) -> Float[Tensor, "8 3"]:
-    return torch.cartesian_prod(
-        *(torch.tensor(pair, dtype=torch.float64) for pair in zip(box.lower, box.upper, strict=True))
-    )
+def _points(box: Box, count: int = BOX_POINTS) -> Float[Tensor, "n 3"]:
+    """A lattice of points over a box, corners included, mm."""
+    ends = zip(box.lower, box.upper, strict=True)
+    return torch.cartesian_prod(*(torch.linspace(low, high, count, dtype=torch.float64) for low, high in ends))

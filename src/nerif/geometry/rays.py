@@ -1,7 +1,7 @@
-"""Rays: all that a path integral needs to know of a measurement, and nothing about cameras.
+"""Rays: the input of a path integral, without reference to cameras.
 
-A ray is back-traced from a pixel. Where it ends on a background, refraction by dn at path length s moves the point it
-ends on by (s_b - s) dn / n, and the sensitivity S (2 x 3, px/mm) turns that movement into pixels:
+A ray is traced back from a pixel to a background at path length s_b. Refraction by dn at path length s shifts its end
+by (s_b - s) dn / n, and the sensitivity S (2 x 3, px/mm) converts this shift into pixels:
 
     d = integral (s_b - s) S grad(n) / n ds
 """
@@ -25,7 +25,7 @@ __all__ = ["BackgroundPoints", "Rays"]
 
 @dataclass(frozen=True)
 class BackgroundPoints(Columns):
-    """Where rays end on a background, and how a movement there is seen.
+    """Ends of rays on a background, and the sensitivity of the image to shifts there.
 
     Parameters
     ----------
@@ -43,14 +43,14 @@ class Rays(Columns):
 
     Parameters
     ----------
-    origin : (n, 3) camera centre, mm; of a telecentric camera the point of its plane z_cam = 0 that the ray starts from
+    origin : (n, 3) camera centre, mm; of a telecentric camera the ray's point on the plane z_cam = 0
     direction : (n, 3) unit vector, away from the camera
-    near, far : (n,) path lengths between which the ray is inside the box, mm; far <= near where it misses
-    pixel : (n, 2) the pixel (column, row) that sees it, px
-    view : (n,) number of the view
-    begin : (n,) path length before which there is no ray, mm: 0, or -inf for a camera that sees along parallel lines
-    background : what they see on a background, or None
-    lens : the lens that each passes in the middle, and the window it stands for; None where a pixel sees a thin ray
+    near, far : (n,) path lengths between which the ray is inside the box, mm; far <= near for a ray that misses it
+    pixel : (n, 2) column and row, px
+    view : (n,) index of the view
+    begin : (n,) path length at which the ray begins, mm: 0, or -inf for a telecentric camera
+    background : its ends on the background, or None
+    lens : the lens about each ray, and the window of its pixel; None for thin rays
     """
 
     origin: Float[Tensor, "n 3"]
@@ -76,12 +76,12 @@ class Rays(Columns):
 
     @staticmethod
     def collect(parts: Iterable[Rays], most: int) -> Rays:
-        """Join one part or more, at most so many rays, in single precision, holding no more than one part twice."""
+        """Join one or more parts, at most `most` rays, in single precision, with at most one part in memory twice."""
         whole, count = None, 0
 
-        def put(place: Tensor, given: Tensor) -> Tensor:
-            place[count : count + len(given)] = given
-            return place
+        def put(target: Tensor, column: Tensor) -> Tensor:
+            target[count : count + len(column)] = column
+            return target
 
         for part in parts:
             part = part.to(dtype=torch.float32)
@@ -89,7 +89,7 @@ class Rays(Columns):
                 whole = part.each(lambda x: torch.empty(most, *x.shape[1:], dtype=x.dtype))
             whole.each(put, part)
             count += len(part)
-        assert whole is not None, "there is a part at least"
+        assert whole is not None, "expected at least one part"
         return whole[:count]
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Rays:
@@ -98,42 +98,34 @@ class Rays(Columns):
 
     @property
     def crosses(self) -> Bool[Tensor, " n"]:
-        """Which rays pass through the box they were clipped to."""
+        """Whether rays cross the box to which they were clipped."""
         return self.far > self.near
 
     @property
     def unobstructed(self) -> Bool[Tensor, " n"]:
-        """Which rays pass through the box before they end on their background, if they have one."""
+        """Whether rays cross the box, entirely in front of their background if they have one."""
         return self.crosses if self.background is None else self.crosses & (self.background.distance > self.far)
 
     @property
     def ends(self) -> BackgroundPoints:
-        """Where the rays end on their background.
-
-        Raises
-        ------
-        InputError
-            If they have none.
-        """
+        """Ends on the background, which has to be there."""
         if self.background is None:
-            raise InputError(
-                "expected cameras that look at a background, got some without; name its plane", field="background"
-            )
+            raise InputError("expected cameras with a background, got some without; name its plane", field="background")
         return self.background
 
     @property
     def end_points(self) -> Float[Tensor, "n 3"]:
-        """The points of the background that the straight rays end on, mm."""
+        """Points of the background at which the straight rays end, mm."""
         return self.origin + self.ends.distance[:, None] * self.direction
 
     def at(self, s: Float[Tensor, "n m"]) -> Float[Tensor, "n m 3"]:
-        """Points at path lengths s (mm), mm."""
+        """Return points at path lengths s (mm), mm."""
         return self.origin[:, None, :] + s[..., None] * self.direction[:, None, :]
 
     def clip(self, box: Box) -> Rays:
-        """Return the rays with near and far set to where they enter and leave the box (slab method)."""
+        """Return the rays with near and far at their intersections with the box (slab method)."""
         lower, upper = constant(box.lower, self.origin), constant(box.upper, self.origin)
-        # a ray along a face divides 0 by 0: nudge the direction, not the answer
+        # a ray along a face divides 0 by 0: perturb the direction, not the result
         direction = torch.where(self.direction.abs() < 1e-12, torch.full_like(self.direction, 1e-12), self.direction)
         a, b = (lower - self.origin) / direction, (upper - self.origin) / direction
         near = torch.minimum(a, b).amax(dim=-1).maximum(self.begin)
@@ -142,28 +134,21 @@ class Rays(Columns):
         return replace(self, near=near, far=torch.maximum(far, near), lens=lens)
 
     def through(self, points: Float[Tensor, "n k 4"]) -> Rays:
-        """Return the n k rays through points of the lens, each for a pixel of the window to what it has in focus.
+        """Return the n k rays through points of the lens, each towards the plane in focus of a pixel of the window.
 
-        They are clipped to the same box.
-
-        A movement of the background point is seen as S has it, whatever ray it was that moved it in its plane:
+        They are clipped to the same box. With the origin L, direction t', end X_0' and the background's normal n,
 
             s_b' = n . (X_0' - L) / n . t',      S' = S - S t' n^T / (n . t')
 
         Parameters
         ----------
-        points : of the lens, in shares of its radius, and of the window, in shares of half its edge (`spread_points`)
-
-        Raises
-        ------
-        InputError
-            If the rays pass no lens.
+        points : of the lens over its radius, and of the window over half its edge (`spread_points`)
         """
         if self.lens is None:
             raise InputError("expected rays through a lens, got thin ones", field="aperture_diameter")
         each, ends, shift = points.shape[1], self.background, self.lens.points(points[..., :2])
         start, toward, reach = self._of_window(points[..., 2:])
-        # of either sign: a telecentric camera's z_cam = 0 may be behind what is in focus
+        # of either sign: a telecentric camera's z_cam = 0 may be behind the plane in focus
         direction = torch.nn.functional.normalize(toward - shift / (self.lens.focus[:, None, None] * reach), dim=-1)
         whole = replace(self, lens=None, background=None).each(lambda x: x.repeat_interleave(each, dim=0))
         if ends is not None:
@@ -171,8 +156,8 @@ class Rays(Columns):
             along = (direction * normal).sum(-1)
             to_plane = ends.distance[:, None, None] * reach * toward - shift
             # written out, since a matrix product may be of reduced precision
-            seen = (direction[:, :, None] * ends.sensitivity[:, None]).sum(-1)
-            sensitivity = ends.sensitivity[:, None] - seen[..., None] * (normal / along[..., None])[:, :, None]
+            along_ray = (direction[:, :, None] * ends.sensitivity[:, None]).sum(-1)
+            sensitivity = ends.sensitivity[:, None] - along_ray[..., None] * (normal / along[..., None])[:, :, None]
             distance = (to_plane * normal).sum(-1) / along
             ends = BackgroundPoints(sensitivity.flatten(0, 1), distance.flatten(0, 1))
         origin = (self.origin[:, None] + start + shift).flatten(0, 1)
@@ -180,44 +165,22 @@ class Rays(Columns):
         return whole if self.lens.box is None else whole.clip(self.lens.box)
 
     def spread(self, each: int, generator: torch.Generator | None = None) -> Rays:
-        """Return so many rays for each, evenly through its lens and over its window (`through`).
+        """Return `each` rays per ray, evenly over its lens and its window (`through`).
 
         Parameters
         ----------
-        generator : of where they are; None for the same places every time
+        generator : of their places; None: the same places in each call
         """
         points = spread_points(len(self), each, generator).to(self.near.dtype)
         return self.through(sent(points, self.near.device))
 
     def _of_window(
         self, square: Float[Tensor, "n k 2"]
-    ) -> tuple[
-        Float[
-            Tensor,
-            (
-                n  # k 3
-            ),
-        ],
-        Float[
-            Tensor,
-            (
-                n  # k 3
-            ),
-        ],
-        Float[
-            Tensor,
-            (
-                n  # k 1
-            ),
-        ],
-    ]:
-        """Where thin rays of other pixels start, mm from the origin, their directions, and how far off they end.
-
-        The last is a share of the path length of the ray in the middle.
-        """
-        toward, nowhere = self.direction[:, None], torch.zeros_like(self.direction[:, None])
+    ) -> tuple[Float[Tensor, "n _ 3"], Float[Tensor, "n _ 3"], Float[Tensor, "n _ 1"]]:
+        """Starts of the thin rays of other pixels, mm from the origin, their directions and their relative lengths."""
+        toward, zero = self.direction[:, None], torch.zeros_like(self.direction[:, None])
         if self.lens is None or self.background is None or not bool(self.lens.window.any()):
-            return nowhere, toward, torch.ones_like(toward[..., :1])
+            return zero, toward, torch.ones_like(toward[..., :1])
         ends, parallel = self.background, self.lens.parallel[:, None, None]
         aside = self.lens.shifts(square, ends.sensitivity, self.direction)
         along, length = (aside * toward).sum(-1, keepdim=True), ends.distance[:, None, None]
@@ -227,7 +190,7 @@ class Rays(Columns):
         return start, torch.where(parallel, toward, end / reach), reach / length
 
     def half_width(self, s: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
-        """Return half the width (mm) of what the pixels of rays gather light from at path lengths s, mm."""
+        """Return half the width (mm) of the ray bundles of pixels at path lengths s, mm."""
         if self.lens is None:
             return torch.zeros_like(s)
         cone = self.lens.radius * (1 - s / self.lens.focus)
@@ -237,25 +200,19 @@ class Rays(Columns):
         window = self.lens.window / torch.linalg.matrix_norm(self.background.sensitivity, 2).clamp_min(1e-12) * share
         return torch.hypot(cone, window)
 
-    def mean_of(self, each: int, seen: Float[Tensor, "m c"]) -> Float[Tensor, "n c"]:
-        """Return the mean of what the rays of a pixel see; one that a background ends before the box carries no light.
-
-        Parameters
-        ----------
-        each : rays of a pixel, which follow one another (`through`)
-        seen : of all of them
-        """
-        return (seen * self.shares(each)[:, None]).unflatten(0, (-1, each)).sum(dim=1)
+    def mean_of(self, each: int, values: Float[Tensor, "m c"]) -> Float[Tensor, "n c"]:
+        """Return the mean over each pixel of the values of its `each` consecutive rays (`through`)."""
+        return (values * self.shares(each)[:, None]).unflatten(0, (-1, each)).sum(dim=1)
 
     def shares(self, each: int) -> Float[Tensor, " m"]:
-        """Return the share that each ray has in the mean of its pixel, which has so many."""
+        """Return the weight of each ray in the mean of its pixel: 0 if the background ends it before the box."""
         if self.background is None:
             return torch.full_like(self.near, 1 / each)
         carries = (~self.crosses | self.unobstructed).to(self.near).unflatten(0, (-1, each))
         return (carries / carries.sum(dim=1, keepdim=True).clamp_min(1)).flatten()
 
     def exit_faces(self, box: Box, faces: Sequence[str]) -> Bool[Tensor, " n"]:
-        """Which rays enter or leave the box through one of the named faces."""
+        """Return which rays enter or leave the box through one of the named faces."""
         hit = torch.zeros(len(self), dtype=torch.bool, device=self.origin.device)
         tolerance = 1e-4 * min(box.edges)
         for s in (self.near, self.far):

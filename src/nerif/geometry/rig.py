@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from nerif.common.conventions import InputError
+from nerif.common.conventions import LARGEST_LENGTH, InputError, check_positive
 from nerif.geometry.camera import Camera, Plane, Projection, projection_named
 from nerif.geometry.grid import Box
 
@@ -17,51 +17,49 @@ __all__ = ["Ring", "paper_rig"]
 
 @dataclass(frozen=True)
 class Ring:
-    """A ring of equal cameras that look at the origin, z up."""
+    """A ring of identical cameras aimed at the origin, z up."""
 
     views: int = 9
     """Number of cameras, equally spaced over the arc, both ends included."""
     arc: tuple[float, float] = (0.0, 170.0)
     """First and last azimuth, degrees."""
     extra_angles: tuple[float, ...] = ()
-    """Azimuths of further cameras, degrees (to be held out, say)."""
+    """Azimuths of further cameras, such as withheld ones, degrees."""
     elevation: float = 0.0
-    """Of the optical axes above the horizontal, degrees."""
+    """Elevation of the optical axes above the horizontal, degrees."""
     projection: str = "perspective"
-    """perspective, or telecentric: along parallel rays."""
+    """Projection: perspective, or telecentric (parallel rays)."""
     focal_length: float = 50.0
     """Focal length, mm."""
     magnification: float | None = None
-    """Size of the image over that of the object, of telecentric lenses; focal_length / distance if not given."""
+    """Magnification of telecentric lenses; default: focal_length / distance."""
     pixel_pitch: float = 0.02
     """Pixel pitch of the sensor, mm."""
     image_size: tuple[int, int] = (200, 200)
     """Image height and width, px."""
     distance: float = 700.0
-    """Lens to centre of the box, mm."""
+    """Distance from the lens to the centre of the box, mm."""
     background_distance: float = 500.0
-    """Centre of the box to background, mm."""
+    """Distance from the centre of the box to the background, mm."""
 
     def __post_init__(self) -> None:
-        for name in ("views", "focal_length", "pixel_pitch", "distance", "background_distance"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise InputError(f"expected a positive number, got {getattr(self, name)}", field=name)
+        lengths = ("focal_length", "pixel_pitch", "distance", "background_distance")
+        check_positive(self, "views", *lengths, limit=LARGEST_LENGTH)
         for name in ("arc", "extra_angles", "elevation"):
             if not math.isfinite(math.fsum(np.atleast_1d(getattr(self, name)))):
                 raise InputError(f"expected degrees, got {getattr(self, name)}", field=name)
         perspective = self.kind.shows_depth
         if self.magnification is not None and (perspective or not 0 < self.magnification < math.inf):
+            got = f"{self.magnification} with {self.projection}"
             raise InputError(
-                f"expected a positive number, with projection = telecentric, got {self.magnification} "
-                f"with {self.projection}",
-                field="magnification",
+                f"expected a positive number, with projection = telecentric, got {got}", field="magnification"
             )
         if min(self.image_size) < 1:
             raise InputError(f"expected (height, width) > 0 px, got {self.image_size}", field="image_size")
 
     @property
     def kind(self) -> Projection:
-        """The projection of the cameras."""
+        """Projection of the cameras."""
         return projection_named(self.projection)
 
     @property
@@ -78,17 +76,12 @@ class Ring:
         return tuple(first + i * step for i in range(self.views)) + tuple(self.extra_angles)
 
     def cameras(self, f_number: float = 0.0) -> tuple[Camera, ...]:
-        """Build the cameras, named by their azimuth.
-
-        Parameters
-        ----------
-        f_number : focal length over aperture, of telecentric lenses on the sensor's side; 0 for thin rays
-        """
+        """Return the cameras, named by their azimuth; an f-number of 0 is for thin rays."""
         names = [f"{angle:g}deg" for angle in self.angles]
         if len(set(names)) < len(names):
             raise InputError(f"expected cameras at different angles, got {', '.join(names)}", field="views")
         cameras = (self._camera(angle, name) for angle, name in zip(self.angles, names, strict=True))
-        return tuple(camera.stopped_down(self.pixel_pitch, f_number) for camera in cameras)
+        return tuple(camera.with_f_number(self.pixel_pitch, f_number) for camera in cameras)
 
     def _camera(self, azimuth: float, name: str) -> Camera:
         a, e = math.radians(azimuth), math.radians(self.elevation)
@@ -116,9 +109,9 @@ class Ring:
 def paper_rig(pixels: int = 200, extra_angles: tuple[float, ...] = ()) -> tuple[tuple[Camera, ...], Box]:
     """Return the cameras and the box of the paper's numerical study (paper, Tab. I).
 
-    Nine views at 0-170 degrees, 200 x 200 pixels of 20 um, a 50 mm lens, a 50 mm cube seen whole. The paper leaves the
-    two distances open; 700 mm to the centre and 500 mm on to the background fit the cube in the image. With other
-    `pixels` the sensor keeps its size and its pixels grow.
+    Nine views at 0-170 degrees, 200 x 200 pixels of 20 um, a 50 mm lens, a 50 mm cube entirely in the image. The paper
+    does not state the distances; here they are 700 mm to the centre and another 500 mm to the background. With other
+    `pixels` the size of the sensor stays the same.
     """
     ring = Ring(pixel_pitch=0.02 * 200 / pixels, image_size=(pixels, pixels), extra_angles=extra_angles)
     return ring.cameras(), Box.cube(50.0)

@@ -2,7 +2,7 @@
 
 With w = F (x - p), F the frame (rows e1, e2, e3) and p a point,
 
-    axis      (r, h) = (sqrt(w1^2 + w2^2 + d^2), w3)     e3 along the axis through p, d a length that rounds it
+    axis      (r, h) = (sqrt(w1^2 + w2^2 + d^2), w3)     e3 along the axis through p, d a small length
     planar    (r, h) = (w1, w3)                           e2 along the direction in which the field is constant
 
 A nearly axisymmetric field has N azimuthal harmonics as well: with u = (w1 + i w2) / r,
@@ -30,104 +30,39 @@ from nerif.geometry.grid import Box
 
 __all__ = ["NAMES", "NO_SYMMETRY", "Axis", "Symmetry", "parse_symmetry"]
 
-TOLD = 0.5  # of a standard deviation beforehand, below which the data tell a number
-NAMES = ("shift_1", "shift_2", "lean_1", "lean_2")
-"""Shifts (mm) along e1 and e2 of the frame, leans (rad) towards them."""
-
-
-@dataclass(frozen=True)
-class Axis:
-    """An axis that was found.
-
-    Parameters
-    ----------
-    symmetry : about it
-    values, sigma, sigma_after : of NAMES, against the axis as named; sigma 0 for what was held
-    residual : rms over sigma of what the coarse field leaves (over the rms measured, where sigma is not known)
-    """
-
-    symmetry: Symmetry
-    values: tuple[float, ...]
-    sigma: tuple[float, ...]
-    sigma_after: tuple[float, ...]
-    residual: float
-
-    @property
-    def told(self) -> tuple[bool, ...]:
-        """Whether the data tell each of the numbers."""
-        return tuple(b > 0 and a < TOLD * b for a, b in zip(self.sigma_after, self.sigma, strict=True))
-
-    @property
-    def record(self) -> dict[str, Any]:
-        """What the metrics of a result hold of it."""
-        named = {
-            "values": dict(zip(NAMES, self.values, strict=True)),
-            "sigma": dict(zip(NAMES, self.sigma, strict=True)),
-            "sigma_after": dict(zip(NAMES, self.sigma_after, strict=True)),
-            "told": dict(zip(NAMES, self.told, strict=True)),
-        }
-        return {"symmetry": asdict(self.symmetry), **named}
-
-    @property
-    def sentences(self) -> list[str]:
-        """What to say of it."""
-        x, y, z = self.symmetry.point
-        if not self.symmetry.axial:
-            along = ", ".join(f"{v:.2f}" for v in self.symmetry.direction)
-            return [f"planar: alike along ({along})"]
-        found = []
-        for i, unit in enumerate(("mm", "mm", "deg", "deg")):
-            if not self.sigma[i]:
-                continue
-            factor = 1.0 if unit == "mm" else math.degrees(1.0)
-            kind = ("shifted by", "leaning by")[i // 2]
-            e = self.symmetry.frame[i % 2]
-            toward = "(" + ", ".join(f"{v:.2f}" for v in e) + ")"
-            if self.told[i]:
-                found.append(
-                    f"{kind} {self.values[i] * factor:+.3g} +- {self.sigma_after[i] * factor:.2g} {unit} to {toward}"
-                )
-            else:
-                found.append(f"what the views do not tell is as given: {kind.split()[0]} to {toward}")
-        return [f"axis: through ({x:.3f}, {y:.3f}, {z:.3f}) mm", *found]
-
-
 NO_SYMMETRY = "none"
-MOST_HARMONICS = 8
-ALONG = math.cos(math.radians(45))  # of a face's normal and a direction, from which the face lies across it
+MAX_HARMONICS = 8
+COS_45 = math.cos(math.radians(45))  # faces whose normals are further than 45 degrees from a direction lie along it
+MAX_POSTERIOR = 0.5  # of the prior standard deviation, of a parameter that the data constrain
+NAMES = ("shift_1", "shift_2", "lean_1", "lean_2")
+"""Shifts (mm) of an axis along e1 and e2 of the frame, leans (rad) towards them."""
 
 
 def parse_symmetry(text: str) -> tuple[str, int] | None:
-    """Return the kind of a symmetry and its harmonics; None for none.
-
-    Raises
-    ------
-    InputError
-        If it is not none, axis, axis+N or planar.
-    """
+    """Return kind and number of harmonics of a symmetry (none, axis, axis+N or planar); None for none."""
     if text == NO_SYMMETRY:
         return None
-    found = re.fullmatch(r"(planar)|axis(?:\+(\d+))?", text)
-    if not found or int(found[2] or 0) > MOST_HARMONICS:
+    match = re.fullmatch(r"(planar)|axis(?:\+(\d+))?", text)
+    if not match or int(match[2] or 0) > MAX_HARMONICS:
         raise InputError(
-            f"expected {NO_SYMMETRY}, axis, axis+N (N harmonics of the angle, at most {MOST_HARMONICS}) or "
+            f"expected {NO_SYMMETRY}, axis, axis+N (N harmonics of the azimuth, at most {MAX_HARMONICS}) or "
             f"planar, got '{text}'",
             field="symmetry",
         )
-    return found[1] or "axis", int(found[2] or 0)
+    return match[1] or "axis", int(match[2] or 0)
 
 
 @dataclass(frozen=True)
 class Symmetry:
-    """Which places have the same value.
+    """A symmetry of a field.
 
     Parameters
     ----------
     kind : axis, or planar
-    point : of the axis, mm; of a planar field any
-    frame : (e1, e2, e3), unit vectors at right angles; e3 along the axis, or e2 along the line
-    rounding : d, mm, at least a millionth of what is looked at
-    harmonics : N, of the angle around an axis
+    point : p, mm, on the axis; of a planar field any
+    frame : (e1, e2, e3), orthonormal; e3 along the axis, or e2 along the direction in which the field is constant
+    rounding : d, mm, at least a millionth of the size of the field
+    harmonics : N, of the azimuth
     """
 
     kind: str
@@ -140,7 +75,7 @@ class Symmetry:
     def about(
         cls, text: str, point: tuple[float, float, float], direction: tuple[float, float, float], rounding: float
     ) -> Symmetry | None:
-        """Return the symmetry of a name about a line through a point (mm) in a direction of any length."""
+        """Return the symmetry of a name (`parse_symmetry`) about a line through a point (mm) in a direction."""
         parsed = parse_symmetry(text)
         if parsed is None:
             return None
@@ -149,8 +84,8 @@ class Symmetry:
         if not float(line.norm()) > 0:
             raise InputError(f"expected a direction (x, y, z), got {direction}", field="axis_direction")
         line = line / line.norm()
-        # e1 as near as may be to the first coordinate that is not along the line
-        first = torch.eye(3, dtype=torch.float64)[1 if abs(float(line[0])) > ALONG else 0]
+        # e1 as close as possible to the first coordinate axis that is not along the line
+        first = torch.eye(3, dtype=torch.float64)[1 if abs(float(line[0])) > COS_45 else 0]
         e1 = first - (first @ line) * line
         e1 = e1 / e1.norm()
         rows = (e1, torch.linalg.cross(line, e1), line)
@@ -160,25 +95,25 @@ class Symmetry:
         return cls(kind, point, frame, rounding, harmonics)
 
     @classmethod
-    def kept(cls, plain: Mapping[str, Any]) -> Symmetry:
-        """Return what a file keeps of one (dataclasses.asdict)."""
-        x, y, z = plain["point"]
-        frame = tuple((a, b, c) for a, b, c in plain["frame"])
-        return cls(plain["kind"], (x, y, z), frame, float(plain["rounding"]), int(plain["harmonics"]))
+    def from_entries(cls, entries: Mapping[str, Any]) -> Symmetry:
+        """Return the symmetry of the entries of a file (dataclasses.asdict)."""
+        x, y, z = entries["point"]
+        frame = tuple((a, b, c) for a, b, c in entries["frame"])
+        return cls(entries["kind"], (x, y, z), frame, float(entries["rounding"]), int(entries["harmonics"]))
 
     @property
     def axial(self) -> bool:
-        """Whether it is about an axis."""
+        """Whether the symmetry is about an axis."""
         return self.kind == "axis"
 
     @property
     def angles(self) -> int:
-        """K, numbers that the field has at a place (r, h)."""
+        """K, the number of azimuths with a field f_k(r, h)."""
         return 2 * self.harmonics + 1
 
     @property
     def direction(self) -> tuple[float, float, float]:
-        """Unit vector along the axis, or along the line on which nothing changes."""
+        """Unit vector along the axis, or in the direction in which the field is constant."""
         return self.frame[2 if self.axial else 1]
 
     @cached_property
@@ -197,13 +132,13 @@ class Symmetry:
         return self.of_local(self.local(points))
 
     def of_local(self, w: Points) -> Points:
-        """Return (r, 0, h) of places in the frame."""
+        """Return (r, 0, h) of points w."""
         x, y, h = w.unbind(-1)
         r = (x * x + y * y + self.rounding**2).sqrt() if self.axial else x
         return torch.stack([r, torch.zeros_like(r), h], dim=-1)
 
-    def turned_back(self, w: Points, slope: Vectors) -> Vectors:
-        """Return the gradient in space of a field whose slopes along (r, -, h) are given, at places in the frame."""
+    def gradient(self, w: Points, slope: Vectors) -> Vectors:
+        """Return the gradient in space of a field with the slopes d/d(r, -, h) at points w."""
         if self.axial:
             r = (w[..., 0].square() + w[..., 1].square() + self.rounding**2).sqrt()
             along = torch.stack([slope[..., 0] * w[..., 0] / r, slope[..., 0] * w[..., 1] / r, slope[..., 2]], dim=-1)
@@ -212,39 +147,39 @@ class Symmetry:
         return self._in_space(along)
 
     def shares(self, w: Points) -> tuple[Float[Tensor, "*n k"], Float[Tensor, "*n k 3"]]:
-        """Return D_k at places in the frame, and its gradient in space, 1/mm."""
+        """Return D_k at points w, and its gradient in space, 1/mm."""
         count = self.angles
         share = torch.ones(*w.shape[:-1], count, dtype=w.dtype, device=w.device)
         slope = torch.zeros(*share.shape, 3, dtype=w.dtype, device=w.device)
         x, y = w[..., 0], w[..., 1]
         r = (x * x + y * y + self.rounding**2).sqrt()
         u = torch.complex(x, y) / r
-        toward = torch.stack([x, y], dim=-1) / r[..., None]  # of r
+        grad_r = torch.stack([x, y], dim=-1) / r[..., None]
         one = torch.tensor([1, 1j], dtype=u.dtype, device=w.device)
-        turn = (one - u[..., None] * toward) / r[..., None]  # of u
+        grad_u = (one - u[..., None] * grad_r) / r[..., None]
         angle = 2 * math.pi * torch.arange(count, dtype=w.dtype, device=w.device) / count
         power = torch.ones_like(u)
         for m in range(1, self.harmonics + 1):
             phase = torch.polar(torch.ones_like(angle), -m * angle)
-            rise = (m * power)[..., None] * turn
-            slope[..., :2] += 2 * (rise[..., None, :] * phase[:, None]).real
+            grad = (m * power)[..., None] * grad_u  # of u^m
+            slope[..., :2] += 2 * (grad[..., None, :] * phase[:, None]).real
             power = power * u
             share = share + 2 * (power[..., None] * phase).real
         return share / count, self._in_space(slope / count)
 
     def _in_space(self, along: Vectors) -> Vectors:
-        """Components along x, y, z of vectors given along e1, e2, e3."""
+        """Components along x, y, z of vectors with components along e1, e2, e3."""
         return torch.stack([(along * column).sum(-1) for column in self.matrix.to(along).T], dim=-1)
 
     def places(self, r: Tensor, angle: Tensor, h: Tensor) -> Points:
-        """Return points (mm) at (r, h) and an angle around the axis, rad; on the plane through p where it is planar."""
+        """Return the points (mm) at (r, h) and an azimuth, rad; for a planar field in the plane through p."""
         w = torch.stack([r * angle.cos(), r * angle.sin(), h], dim=-1)
         if not self.axial:
             w = torch.stack([r, torch.zeros_like(r), h], dim=-1)
         return w.new_tensor(self.point) + self._in_space(w)
 
-    def moved(self, shift: tuple[float, float], turn: tuple[float, float]) -> Symmetry:
-        """Return it shifted along e1 and e2 (mm) and leant towards them (rad)."""
+    def move(self, shift: tuple[float, float], turn: tuple[float, float]) -> Symmetry:
+        """Return the symmetry shifted along e1 and e2 (mm) and tilted towards them (rad)."""
         frame = self.matrix
         e3 = frame[2] + turn[0] * frame[0] + turn[1] * frame[1]
         e3 = e3 / e3.norm()
@@ -255,42 +190,31 @@ class Symmetry:
         x, y, z = point.tolist()
         return replace(self, point=(x, y, z), frame=tuple((a, b, c) for a, b, c in rows))
 
-    def near(self, other: Symmetry, apart: float) -> bool:
-        """Return whether another is of the same kind about nearly the same axis.
-
-        Parameters
-        ----------
-        apart : largest difference of its coordinates, in their unit, and of the directions
-        """
+    def near(self, other: Symmetry, tolerance: float) -> bool:
+        """Return whether another symmetry has the same kind, and p and frame within this tolerance."""
         mine, others = ((*s.point, *(x for row in s.frame for x in row)) for s in (self, other))
         same = (self.kind, self.harmonics) == (other.kind, other.harmonics)
-        return same and all(abs(a - b) <= apart for a, b in zip(mine, others, strict=True))
+        return same and all(abs(a - b) <= tolerance for a, b in zip(mine, others, strict=True))
 
     def in_units(self, centre: tuple[float, float, float], unit: float) -> Symmetry:
-        """Return it in coordinates (x - centre) / unit."""
+        """Return the symmetry in coordinates (x - centre) / unit."""
         x, y, z = ((p - c) / unit for p, c in zip(self.point, centre, strict=True))
         return replace(self, point=(x, y, z), rounding=self.rounding / unit)
 
     def faces(self, names: tuple[str, ...]) -> tuple[str, ...]:
-        """Return the faces of (r, -, h) that faces of a box stand for: x+ for those around an axis, z- and z+."""
-        found = []
+        """Return the faces in (r, -, h) of faces of a box: x+ for those around an axis, z- and z+."""
+        faces = []
         for name in names:
             normal = self.matrix[:, FACES.index(name) // 2] * (1 if name[1] == "+" else -1)
             if self.axial:
-                found.append("x+" if abs(normal[2]) < ALONG else f"z{'+' if normal[2] > 0 else '-'}")
-            elif abs(normal[1]) < ALONG:
-                row = 0 if abs(normal[0]) >= ALONG else 2
-                found.append("xyz"[row] + ("+" if normal[row] > 0 else "-"))
-        return tuple(dict.fromkeys(found))
+                faces.append("x+" if abs(normal[2]) < COS_45 else f"z{'+' if normal[2] > 0 else '-'}")
+            elif abs(normal[1]) < COS_45:
+                row = 0 if abs(normal[0]) >= COS_45 else 2
+                faces.append("xyz"[row] + ("+" if normal[row] > 0 else "-"))
+        return tuple(dict.fromkeys(faces))
 
     def reduced_box(self, box: Box, ambient: tuple[str, ...]) -> Box:
-        """Return the box of (r, -, h) that a box in space fills; about an axis no wider than to an ambient face.
-
-        Parameters
-        ----------
-        box : Box, mm
-        ambient : its faces on which the field is ambient, beyond which nothing is looked for
-        """
+        """Return the box in (r, -, h) of a box in space, mm; about an axis it ends at the nearest ambient face."""
         unit = torch.cartesian_prod(*[torch.tensor([0.0, 1.0], dtype=torch.float64)] * 3)
         w = self.local(torch.tensor(box.lower, dtype=torch.float64) + unit * torch.tensor(box.edges))
         low, high = w.amin(dim=0).tolist(), w.amax(dim=0).tolist()
@@ -298,10 +222,69 @@ class Symmetry:
             low[0], high[0] = 0.0, float(w[:, :2].norm(dim=1).max())
             for name in ambient:
                 axis, sign = FACES.index(name) // 2, 1 if name[1] == "+" else -1
-                if abs(float(self.matrix[2, axis])) < ALONG:
+                if abs(float(self.matrix[2, axis])) < COS_45:
                     face = box.upper[axis] if sign > 0 else box.lower[axis]
                     high[0] = min(high[0], sign * (face - self.point[axis]))
             if not high[0] > 0:
                 raise InputError(f"expected the axis within the box, got {self.point} mm", field="axis_point")
         width = (high[0] - low[0]) / 2
         return Box((low[0], -width, low[2]), (high[0], width, high[2]))
+
+
+@dataclass(frozen=True)
+class Axis:
+    """A refined axis of symmetry.
+
+    Parameters
+    ----------
+    values : of NAMES, relative to the initial axis
+    sigma, sigma_after : their prior and posterior standard deviations; sigma 0 for a parameter that was not refined
+    residual : rms over sigma of a coarse reconstruction (over the rms of the data, if sigma is unknown)
+    """
+
+    symmetry: Symmetry
+    values: tuple[float, ...]
+    sigma: tuple[float, ...]
+    sigma_after: tuple[float, ...]
+    residual: float
+
+    @property
+    def constrained(self) -> tuple[bool, ...]:
+        """Whether the data constrain each of the parameters."""
+        pairs = zip(self.sigma, self.sigma_after, strict=True)
+        return tuple(prior > 0 and after < MAX_POSTERIOR * prior for prior, after in pairs)
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """Entries of metrics.json."""
+        columns = {
+            "values": self.values,
+            "sigma": self.sigma,
+            "sigma_after": self.sigma_after,
+            "constrained": self.constrained,
+        }
+        named = {key: dict(zip(NAMES, column, strict=True)) for key, column in columns.items()}
+        return {"symmetry": asdict(self.symmetry), **named}
+
+    @property
+    def sentences(self) -> list[str]:
+        """Position and direction of the axis, and their changes by the refinement."""
+        x, y, z = self.symmetry.point
+        if not self.symmetry.axial:
+            return [f"planar: constant along {_vector(self.symmetry.direction)}"]
+        lines = [f"axis: through ({x:.3f}, {y:.3f}, {z:.3f}) mm"]
+        for i, name in enumerate(NAMES):
+            noun, unit, factor = (
+                ("shift", "mm", 1.0) if name.startswith("shift") else ("tilt", "deg", math.degrees(1.0))
+            )
+            direction = _vector(self.symmetry.frame[i % 2])
+            if self.constrained[i]:
+                value, sigma = self.values[i] * factor, self.sigma_after[i] * factor
+                lines.append(f"{noun} towards {direction}: {value:+.3g} +- {sigma:.2g} {unit}")
+            elif self.sigma[i]:
+                lines.append(f"The {noun} towards {direction} cannot be determined; kept at its initial value")
+        return lines
+
+
+def _vector(v: tuple[float, ...]) -> str:
+    return "(" + ", ".join(f"{x:.2f}" for x in v) + ")"

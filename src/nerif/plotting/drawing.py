@@ -1,6 +1,6 @@
-"""Volumes and maps of views, drawn into Axes that the caller gives and gets back: for print, pages and notebooks.
+"""Slices of volumes and maps of views, drawn into Axes of the caller: for print, pages and notebooks.
 
-Sequential colour maps are perceptually uniform, diverging ones centred on 0; the colour-blind can read both.
+Sequential colour maps are perceptually uniform, diverging ones centred on 0; both suit colour-blind readers.
 """
 
 from __future__ import annotations
@@ -31,17 +31,17 @@ __all__ = [
     "draw_map",
     "draw_slice",
     "draw_slices",
-    "drawn_of",
     "label_of",
     "map_colours",
     "map_range",
-    "shown",
+    "plotted_quantities",
+    "plotted_values",
     "style",
 ]
 
 
 class Drawable(Protocol):
-    """What can be drawn in slices: values at the voxel centres of a grid, and which quantity they are. A Volume is."""
+    """Values of a quantity at the voxel centres of a grid, such as a Volume."""
 
     @property
     def values(self) -> Tensor: ...
@@ -52,12 +52,12 @@ class Drawable(Protocol):
 
 
 PLANES = {"z": ("x", "y"), "y": ("x", "z"), "x": ("y", "z")}
-"""Normal of a slice: the axes it is drawn over."""
+"""Normal of a slice, and its horizontal and vertical axis."""
 
 SEQUENTIAL, DIVERGING = "viridis", "RdBu_r"
 
 COLOUR_MAPS = {"temperature": "inferno", "emission": "magma"}
-"""By quantity; the others are drawn in SEQUENTIAL."""
+"""By quantity; SEQUENTIAL for the others."""
 
 COLOURS = {"blue": "#0072B2", "orange": "#D55E00", "green": "#009E73", "grey": "#595959"}  # Okabe & Ito
 
@@ -69,39 +69,33 @@ LABELS = {
     "extinction": ("extinction coefficient", "mm⁻¹"),
     "emission": ("radiance per length", "mm⁻¹"),
 }
-"""What stands at a colour bar, and the unit."""
+"""Label of a colour bar, and unit."""
 
 
-def drawn_of(quantities: Iterable[str]) -> tuple[str, ...]:
-    """Return which of the quantities of a result are drawn: of an index n, which stands for the excess too."""
+def plotted_quantities(quantities: Iterable[str]) -> tuple[str, ...]:
+    """Return the quantities of a result to plot: without statistics, and without the index excess, which n shows."""
     return tuple(q for q in quantities if q != "index_excess" and q.rpartition("_")[2] not in STATISTICS)
 
 
 @contextmanager
 def style(size: float = 7.0) -> Iterator[None]:
-    """Text of `size` points, thin lines, fonts that stay text in PDF and SVG."""
+    """Use text of `size` points, thin lines, and fonts that stay text in PDF and SVG."""
     import matplotlib as mpl
 
+    lines, small = ("axes.linewidth", "xtick.major.width", "ytick.major.width", "hatch.linewidth"), size - 0.5
     settings: Any = {
-        "font.size": size,
-        "axes.titlesize": size,
-        "axes.labelsize": size,
-        "legend.fontsize": size - 0.5,
-        "xtick.labelsize": size - 0.5,
-        "ytick.labelsize": size - 0.5,
-        "axes.linewidth": 0.6,
-        "xtick.major.width": 0.6,
-        "ytick.major.width": 0.6,
+        **dict.fromkeys(("font.size", "axes.titlesize", "axes.labelsize"), size),
+        **dict.fromkeys(("legend.fontsize", "xtick.labelsize", "ytick.labelsize"), small),
+        **dict.fromkeys(lines, 0.6),
         "pdf.fonttype": 42,
         "svg.fonttype": "none",
-        "hatch.linewidth": 0.6,
     }
     with mpl.rc_context(settings):
         yield
 
 
 def label_of(quantity: str) -> str:
-    """Return the label of a colour bar, with its unit: of density, density_std and so on."""
+    """Return the label of a colour bar with its unit, also for statistics such as density_std."""
     base, _, statistic = quantity.rpartition("_")
     if statistic in STATISTICS and base in LABELS:
         name, unit = LABELS[base]
@@ -110,8 +104,8 @@ def label_of(quantity: str) -> str:
     return f"{name} [{unit}]"
 
 
-def shown(volume: Drawable) -> np.ndarray:
-    """Return the values as they are shown, (z, y, x): n as n - 1, the others as they are."""
+def plotted_values(volume: Drawable) -> np.ndarray:
+    """Return the values to plot, (z, y, x): n - 1 for n."""
     values = volume.values.double().numpy()
     return values - 1 if volume.quantity == "n" else values
 
@@ -120,7 +114,7 @@ def draw_slice(
     axes: Axes, volume: Drawable, normal: str, limits: tuple[float, float] | None = None, colour_map: str | None = None
 ) -> Axes:
     """Draw the middle slice of a volume across the axis `normal`; lengths in mm, masked voxels grey."""
-    values = shown(volume)
+    values = plotted_values(volume)
     low, high = limits or colour_range(values)
     axis = "zyx".index(normal)
     plane = np.take(values, values.shape[axis] // 2, axis=axis)
@@ -146,10 +140,7 @@ def draw_slices(
     line: Sequence[Axes], volume: Drawable, limits: tuple[float, float], colour_map: str | None = None, name: str = "",
     doubtful: np.ndarray | None = None,
 ) -> None:  # fmt: skip
-    """Draw the middle slices across z, y and x side by side, each under where it lies (mm) and a name, if given.
-
-    Where `doubtful` (z, y, x) is true, they are hatched.
-    """
+    """Draw the middle slices across z, y and x, titled by name and position (mm), hatched in `doubtful` (z, y, x)."""
     for axes, normal in zip(line, "zyx", strict=True):
         draw_slice(axes, volume, normal, limits, colour_map)
         if doubtful is not None:
@@ -159,7 +150,7 @@ def draw_slices(
 
 
 def _hatch(axes: Axes, doubtful: np.ndarray, normal: str) -> None:
-    """Hatch where the middle slice of a mask is true."""
+    """Hatch the middle slice of a mask."""
     axis = "zyx".index(normal)
     plane = np.take(doubtful, doubtful.shape[axis] // 2, axis=axis)
     if plane.any() and min(plane.shape) > 1:
@@ -170,24 +161,24 @@ def _hatch(axes: Axes, doubtful: np.ndarray, normal: str) -> None:
 
 
 def colour_range(values: np.ndarray) -> tuple[float, float]:
-    """Return the ends of the colours: lowest and highest value, or where a thousandth of the voxels is left beyond.
+    """Return the colour range: lowest and highest finite value (without any: 0 and 1), or 0.1 to 99.9 %.
 
-    The latter where a few outliers would take a fifth of the colours and more. NaN is left out; 0 and 1 for nothing.
+    The latter if outliers would occupy a fifth of the range or more.
     """
-    known = values[np.isfinite(values)]
-    if not known.size:
+    finite = values[np.isfinite(values)]
+    if not finite.size:
         return 0.0, 1.0
-    low, high = float(known.min()), float(known.max())
-    inner = np.quantile(known, [0.001, 0.999])
+    low, high = float(finite.min()), float(finite.max())
+    inner = np.quantile(finite, [0.001, 0.999])
     if inner[1] > inner[0] and high - low > 1.25 * (inner[1] - inner[0]):
         return float(inner[0]), float(inner[1])
     return low, high
 
 
 def map_range(values: np.ndarray, signed: bool, share: float = 1.0) -> tuple[float, float]:
-    """Return the ends of the colours of maps: 0 and the largest value, or where a share of the pixels lies below.
+    """Return the colour range of maps: from 0, or symmetric about it if `signed`, to the quantile `share` of |values|.
 
-    Of what may be negative (`signed`) they are as far below 0 as above. NaN is left out; 1 for nothing.
+    NaN is ignored; the upper end without any value is 1.
     """
     sizes = np.abs(values[np.isfinite(values)])
     high = (float(np.quantile(sizes, share)) if sizes.size else 0.0) or 1.0
@@ -195,12 +186,12 @@ def map_range(values: np.ndarray, signed: bool, share: float = 1.0) -> tuple[flo
 
 
 def map_colours(limits: tuple[float, float]) -> str:
-    """Return the colour map between such ends: a diverging one about 0, a sequential one from 0 up."""
+    """Return the colour map of a range: a diverging one about 0, a sequential one from 0 up."""
     return DIVERGING if limits[0] < 0 else SEQUENTIAL
 
 
 def draw_map(axes: Axes, image: np.ndarray, limits: tuple[float, float]) -> Axes:
-    """Draw what pixels measured between such ends (see map_range); rows downward, unmeasured pixels grey."""
+    """Draw a map of one view in a colour range (map_range); rows downward, NaN grey."""
     axes.set_facecolor("0.8")
     axes.imshow(image, vmin=limits[0], vmax=limits[1], cmap=map_colours(limits), interpolation="nearest")
     axes.set_xlabel("column [px]")
@@ -216,8 +207,8 @@ def add_colour_bar(axes: Sequence[Axes], label: str) -> Axes:
     form.set_powerlimits((-3, 4))
     figure = axes[0].figure
     low, high = axes[-1].images[-1].get_clim()
-    drawn = np.concatenate([np.ma.masked_invalid(np.ma.asarray(a.images[-1].get_array())).compressed() for a in axes])
-    beyond = (bool((drawn < low).any()), bool((drawn > high).any()))
+    values = np.concatenate([np.ma.masked_invalid(np.ma.asarray(a.images[-1].get_array())).compressed() for a in axes])
+    beyond = (bool((values < low).any()), bool((values > high).any()))
     extend = {(True, True): "both", (True, False): "min", (False, True): "max"}.get(beyond, "neither")
     bar = figure.colorbar(axes[-1].images[-1], ax=list(axes), format=form, shrink=0.9, pad=0.02, extend=extend)
     bar.set_label(label)

@@ -1,4 +1,4 @@
-"""What a notebook shows of a noun: an image and a short table, as HTML that loads nothing; and numbers for people."""
+"""Notebook display: an image and a short table as self-contained HTML; and formatted numbers."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ from nerif.plotting.drawing import (
     draw_slices,
     label_of,
     map_range,
-    shown,
+    plotted_values,
     style,
-)
+)  # fmt: skip
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 __all__ = ["image", "number", "panel", "percent", "show_slices", "show_views", "span"]
 
-VIEWS = 9  # that are drawn: of more, as many, evenly spread
-PIXELS = 120  # along an edge of a view, beyond which nothing more is seen
+VIEWS = 9  # to draw at most, evenly spaced
+PIXELS = 120  # along an edge of a view, enough at its size on the page
 
 
 def number(value: object, digits: int = 4) -> str:
-    """Return a number for people, with a power of ten written as such; a dash for what is none."""
+    """Return a formatted number, with a power of ten if it is small or large; a dash for anything else."""
     if not isinstance(value, int | float) or not np.isfinite(value):
         return "–"
     if value == 0 or 1e-3 <= abs(value) < 1e5:
@@ -45,53 +45,52 @@ def number(value: object, digits: int = 4) -> str:
 
 
 def percent(share: float) -> str:
-    """Return a share in per cent; what is there at all is never called 0."""
+    """Return a fraction in per cent; a small one as under 0.01 %, not 0."""
     return "under 0.01%" if 0 < share < 1e-4 else f"{share:.2%}"
 
 
 def span(values: Float[np.ndarray, ...], unit: str = "1", digits: int = 3) -> str:
-    """Return lowest and highest value with their unit, and the share that is masked (NaN)."""
-    known = values[np.isfinite(values)]
-    if not known.size:
+    """Return lowest and highest value with their unit, and the masked fraction (NaN)."""
+    finite = values[np.isfinite(values)]
+    if not finite.size:
         return "masked everywhere"
-    share = 1 - known.size / values.size
+    share = 1 - finite.size / values.size
     masked = f"; {percent(share)} masked" if share else ""
-    low, high = (number(float(x), digits) for x in (known.min(), known.max()))
+    low, high = (number(float(x), digits) for x in (finite.min(), finite.max()))
     return f"{with_unit(f'{low} to {high}', unit)}{masked}"
 
 
 def panel(title: str, rows: Sequence[tuple[str, str]], *images: tuple[str, str]) -> str:
-    """Return a title, images (data addresses, each described in words) and a table of names and values as HTML."""
+    """Return HTML of a title, images (data URL, description) and a table of names and values."""
     cells = "".join(
         f'<tr><th style="text-align:left">{escape(name)}</th><td style="text-align:left">{escape(value)}</td></tr>'
         for name, value in rows
     )
     tags = "".join(
-        f'<img src="{image}" alt="{escape(describes)}" style="display:block;max-width:100%">'
-        for image, describes in images
+        f'<img src="{image}" alt="{escape(alt)}" style="display:block;max-width:100%">' for image, alt in images
     )
     return f"<div><p><b>{escape(title)}</b></p>{tags}<table><tbody>{cells}</tbody></table></div>"
 
 
 def image(draw: Callable[[Figure], object], width: float, height: float, size: float = 8.0, form: str = "png") -> str:
-    """Return a figure of that size (inches), with text of `size` points, as a PNG or SVG in a data address."""
+    """Return a figure of a width and height (inches), with text of `size` points, as a data URL of a PNG or SVG."""
     from matplotlib.figure import Figure
 
     with style(size):
         figure = Figure(figsize=(width, height), layout="constrained")
         draw(figure)
         buffer = io.BytesIO()
-        about = {"Date": None, "Creator": None} if form == "svg" else None  # the same page from the same result
-        figure.savefig(buffer, format=form, dpi=110, metadata=about)
+        metadata = {"Date": None, "Creator": None} if form == "svg" else None  # the same page from the same result
+        figure.savefig(buffer, format=form, dpi=110, metadata=metadata)
     return f"data:image/{'svg+xml' if form == 'svg' else form};base64," + base64.b64encode(buffer.getvalue()).decode()
 
 
 def show_slices(volume: Drawable) -> str:
-    """Return the three middle slices of a volume as a PNG in a data address."""
+    """Return the three middle slices of a volume as a data URL of a PNG."""
 
     def draw(figure: Figure) -> None:
         line = list(figure.subplots(1, 3))
-        draw_slices(line, volume, colour_range(shown(volume)))
+        draw_slices(line, volume, colour_range(plotted_values(volume)))
         add_colour_bar(line, label_of(volume.quantity))
 
     return image(draw, 8.5, 2.8)
@@ -104,26 +103,24 @@ def show_views(
     label: str,
     signed: bool = True,
 ) -> str:
-    """Return the maps of the views, a row a component, NaN where not measured, as a PNG in a data address.
+    """Return the maps of the views, one row per component, as a data URL of a PNG.
 
     Parameters
     ----------
-    names : of the views
-    maps : what was measured
-    components : what the channels are called
+    components : names of the channels
     label : of the colour bar, with the unit
     signed : whether values may be negative
     """
-    chosen = np.unique(np.linspace(0, len(names) - 1, min(len(names), VIEWS)).round().astype(int))
+    indices = np.unique(np.linspace(0, len(names) - 1, min(len(names), VIEWS)).round().astype(int))
     limits = map_range(np.concatenate([m[np.isfinite(m)] for m in maps]), signed, 0.998)
 
     def draw(figure: Figure) -> None:
-        grid = figure.subplots(len(components), len(chosen), squeeze=False)
-        for column, view in enumerate(chosen):
+        grid = figure.subplots(len(components), len(indices), squeeze=False)
+        for column, view in enumerate(indices):
             for row, component in enumerate(components):
                 axes = draw_map(grid[row, column], maps[view][..., row], limits)
                 axes.set(xticks=[], yticks=[], xlabel="", ylabel="" if column else component)
             grid[0, column].set_title(names[view], parse_math=False)
         add_colour_bar(list(grid.ravel()), label)
 
-    return image(draw, min(9.5, 1.6 + 1.1 * len(chosen)), 0.5 + 1.15 * len(components))
+    return image(draw, min(9.5, 1.6 + 1.1 * len(indices)), 0.5 + 1.15 * len(components))

@@ -10,7 +10,7 @@ import torch
 from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
 
-__all__ = ["check_aperture", "lens_rays", "seen_through"]
+__all__ = ["apply_aperture", "check_aperture", "lens_rays"]
 
 APERTURES = ("auto", "on", "off")
 RAYS_PER_PX2, MAX_RAYS = 2, 12  # of a pixel: per square of the cone's radius in px, and at most
@@ -22,7 +22,7 @@ def check_aperture(aperture: str) -> None:
         raise InputError(f"expected one of {', '.join(APERTURES)}, got '{aperture}'", field="aperture")
 
 
-def seen_through(measurement: Measurement, aperture: str) -> Measurement:
+def apply_aperture(measurement: Measurement, aperture: str) -> Measurement:
     """Return the measurement with its lenses and windows ("auto"; "on" requires an aperture) or thin rays ("off")."""
     check_aperture(aperture)
     lenses = [camera.lens for camera in measurement.cameras if camera.lens is not None]

@@ -22,23 +22,19 @@ from nerif.geometry.symmetry import Axis
 __all__ = ["OnStep", "Outcome", "Reconstruction", "Reconstructor", "State", "Step", "compose"]
 
 NOTEBOOK_VOXELS = 48  # along the longest edge
-MISFITS = {
+MISFITS = {  # columns of a history, the most informative first
     "residual_over_sigma": "times the noise, rms over the training views",
     "residual": "rms over the training views, relative to the ambient field",
     "loss": "loss, relative to the ambient field",
 }
-"""Columns of a history, the most informative first, and their meaning."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """Why a reconstruction stopped.
+    """Why a reconstruction stopped: a word, and a sentence with the remedy if there is one.
 
-    Parameters
-    ----------
-    reason : one word: converged, discrepancy, epochs, steps, iterations, time_limit, interrupted, diverged or
-        collapsed (to the ambient field)
-    message : one sentence, with the remedy if there is one
+    The reason is converged, discrepancy, epochs, steps, iterations, time_limit, interrupted, diverged or collapsed (to
+    the ambient field).
     """
 
     reason: str
@@ -160,19 +156,14 @@ class Reconstructor(ABC):
     Invalid settings raise InputError when the record is made.
     """
 
-    aperture: str
-    """Whether pixels have an aperture (aperture.py)."""
-    source: str
-    """Images, displacements or both (sources.py)."""
+    aperture: str  # whether pixels have an aperture (aperture.py)
+    source: str  # images, displacements or both (sources.py)
 
     @abstractmethod
     def __call__(
-        self,
-        measurement: Measurement,
-        on_step: OnStep | None = None,
-        resume: State | None = None,
+        self, measurement: Measurement, on_step: OnStep | None = None, resume: State | None = None,
         start: Field | None = None,
-    ) -> Reconstruction:
+    ) -> Reconstruction:  # fmt: skip
         """Reconstruct the field of a measurement.
 
         A run that is stopped by a limit, the callback or a failure returns its best field; the outcome has the reason.

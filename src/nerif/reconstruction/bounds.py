@@ -7,7 +7,7 @@ import math
 from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
 
-__all__ = ["check_bounds", "check_resumed", "field_bounds", "in_units"]
+__all__ = ["check_bounds", "check_same_bounds", "field_bounds", "in_units"]
 
 
 def check_bounds(lower: float | None, upper: float | None) -> None:
@@ -35,7 +35,7 @@ def field_bounds(measurement: Measurement, lower: float | None, upper: float | N
     return low, high
 
 
-def check_resumed(before: tuple[float, float], bounds: tuple[float, float]) -> None:
+def check_same_bounds(before: tuple[float, float], bounds: tuple[float, float]) -> None:
     """Raise InputError unless the bounds are those of the network to be resumed, which cannot change."""
     if not all(math.isclose(a, b, rel_tol=1e-4) for a, b in zip(before, bounds, strict=True)):
         first, other = (f"{low:g} to {high:g}" for low, high in (before, bounds))

@@ -18,7 +18,6 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from types import TracebackType
 from typing import Literal, NamedTuple, ParamSpec, TypeVar
 
 import torch
@@ -55,15 +54,8 @@ def share_threads() -> None:
 
 
 def free_threads(idle: float, process: float, most: int) -> int:
-    """Return the number of threads to use, each with a core nearly for itself.
-
-    Parameters
-    ----------
-    idle, process : mean number of cores that were idle, and that this process used
-    most : maximum number of threads
-    """
-    fit = (k for k in range(most, 1, -1) if idle + process + max(MIN_LOAD, SHARED_LOAD / k) >= k)
-    return next(fit, 1)
+    """Return the number of threads to use, from the mean numbers of cores that were idle and that this process used."""
+    return next((k for k in range(most, 1, -1) if idle + process + max(MIN_LOAD, SHARED_LOAD / k) >= k), 1)
 
 
 class Used(NamedTuple):
@@ -83,11 +75,7 @@ class Cores:
     used again when cores have been free for a while, which becomes longer each time it was in vain.
 
     Cores are measured at the pauses of the thread (pauses.py). A nested context leaves that to the outer one, so that
-    short computations do not each begin with all threads.
-
-    Parameters
-    ----------
-    device : of the computation; for a GPU nothing is measured
+    short computations do not each begin with all threads. For a GPU nothing is measured.
     """
 
     def __init__(self, device: torch.device) -> None:
@@ -108,9 +96,7 @@ class Cores:
             self._measure(FIRST_SECONDS)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self._stack.close()
 
     def look(self) -> None:

@@ -37,12 +37,7 @@ FIELD, CHECKPOINT = "field.safetensors", "checkpoint.safetensors"
 
 
 def fingerprint(measurement: Measurement, open_faces: tuple[str, ...] = ()) -> dict[str, str]:
-    """Return digests of the parts of a measurement on which a reconstruction depends, by name.
-
-    Parameters
-    ----------
-    open_faces : faces whose rays are dropped
-    """
+    """Return digests of the parts of a measurement on which a reconstruction depends, by name."""
     maps: dict[str, str] = {}
     constants: dict[str, list[Any]] = {}
     for o in measurement.observations:
@@ -105,8 +100,7 @@ def digest(parts: Iterable[Any]) -> str:
 def write_field(directory: Path, result: Reconstruction) -> None:
     """Write a field atomically, with everything needed to evaluate it."""
     field = result.field
-    about: dict[str, Any] = {"n_ambient": result.n_ambient, "outcome": vars(result.outcome)}
-    about |= {"quantity": result.quantity}
+    about = {"n_ambient": result.n_ambient, "outcome": vars(result.outcome), "quantity": result.quantity}
     if isinstance(field, VoxelField):
         box = field.grid.box
         about |= {"kind": "voxels", "shape": field.grid.shape, "degree": field.degree}
@@ -145,10 +139,10 @@ def read_field(directory: Path) -> tuple[Field, Box, float]:
             lower, upper = about["reduced_box"]
             grid = Grid(Box(tuple(lower), tuple(upper)), tuple(about["shape"]))
             parts = [VoxelField(c, grid, int(about["degree"])) for c in tensors["coefficients"]]
-            return SymmetricVoxels(parts, Symmetry.kept(about["symmetry"])), box, n_ambient
+            return SymmetricVoxels(parts, Symmetry.from_entries(about["symmetry"])), box, n_ambient
         shape = NetworkShape.of(about["network"])
         symmetry = about.get("symmetry")
-        network = Network(shape) if symmetry is None else SymmetricNetwork(shape, Symmetry.kept(symmetry))
+        network = Network(shape) if symmetry is None else SymmetricNetwork(shape, Symmetry.from_entries(symmetry))
         network.load_state_dict(tensors)
         network.eval().requires_grad_(False)
         return NeuralField(network, box, float(about["index_scale"]), float(about["offset"])), box, n_ambient

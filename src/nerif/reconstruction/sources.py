@@ -19,8 +19,9 @@ from torch import Tensor
 
 from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement, Observation
+from nerif.forward.images import masked_blur
 
-__all__ = ["Stage", "check_source", "chosen_source", "of_source", "stages"]
+__all__ = ["Stage", "check_source", "of_source", "resolve_source", "stages"]
 
 SOURCES = ("auto", "images", "displacements", "both")
 SOFT_PX = 0.6  # standard deviation
@@ -57,7 +58,7 @@ def check_source(source: str, measurement: Measurement | None = None) -> None:
         raise InputError(f"expected displacements for '{source}', got images alone; give --from images", field="from")
 
 
-def chosen_source(measurement: Measurement, source: str, preferred: str) -> str:
+def resolve_source(measurement: Measurement, source: str, preferred: str) -> str:
     """Return the source, with "auto" replaced by the preferred one if there are both displacements and images."""
     images, displacements = _pair(measurement)
     return preferred if source == "auto" and images is not None and displacements is not None else source
@@ -72,7 +73,7 @@ def of_source(measurement: Measurement, source: str, blur: float = SOFT_PX, pref
     images, displacements = _pair(measurement)
     if images is None:
         return measurement
-    source = chosen_source(measurement, source, preferred)
+    source = resolve_source(measurement, source, preferred)
     if displacements is not None and source == "displacements":
         return images.without(measurement)
     whole = measurement if source == "both" or displacements is None else displacements.without(measurement)
@@ -115,15 +116,11 @@ def _pair(measurement: Measurement) -> tuple[Observation | None, Observation | N
 
 def _extrapolated(measurement: Measurement, displacements: Observation) -> Float[Tensor, "view row column 2"]:
     """The displacement, and where it is not usable a weighted mean of its surroundings."""
-    from scipy.ndimage import gaussian_filter
-
     d, usable = displacements.values, measurement.usable_for(displacements)
     result = torch.zeros_like(d)
     for i, camera in enumerate(measurement.cameras):
         inside = i, slice(0, camera.image_size[0]), slice(0, camera.image_size[1])
-        good = usable[inside][..., None]
-        values = torch.where(good, d[inside], 0.0).double()
-        weight = torch.from_numpy(gaussian_filter(good[..., 0].double().numpy(), FILL_PX)).clamp(min=1e-6)
-        mean = torch.from_numpy(gaussian_filter(values.numpy(), (FILL_PX, FILL_PX, 0))) / weight[..., None]
-        result[inside] = torch.where(good, d[inside], mean.to(d))
+        good = usable[inside]
+        mean = masked_blur(d[inside], good, FILL_PX).to(d)
+        result[inside] = torch.where(good[..., None], d[inside], mean)
     return result

@@ -32,7 +32,7 @@ from nerif.reconstruction.voxels.levels import bins_of
 from nerif.reconstruction.voxels.problem import Penalty, Problem
 from nerif.reconstruction.voxels.symmetric_operator import SymmetricOperator
 
-__all__ = ["axis_of", "check_views", "find_axis", "symmetry_asked", "with_axis"]
+__all__ = ["axis_of", "check_views", "find_axis", "symmetry_of", "with_axis"]
 
 VOXELS = 40  # along the longest edge of the box
 MAX_RAYS = 6000
@@ -71,7 +71,7 @@ def find_axis(
 
     def about(t: Float[Tensor, " 4"]) -> Symmetry:
         a, b, c, d = t.tolist()
-        return axisymmetric.moved((a, b), (c, d))
+        return axisymmetric.move((a, b), (c, d))
 
     def operators(t: Float[Tensor, " 4"]) -> list[SymmetricOperator]:
         symmetry = about(t)
@@ -146,7 +146,7 @@ def _squares(penalty: Penalty) -> Float[Tensor, "m m"]:
     return rows
 
 
-def symmetry_asked(settings: SharedSettings, measurement: Measurement) -> Symmetry | None:
+def symmetry_of(settings: SharedSettings, measurement: Measurement) -> Symmetry | None:
     """Return the symmetry about the axis of the settings; by default through the middle of the box.
 
     Default direction: z for an axis, for a planar flow the edge of the box nearest to the viewing directions.
@@ -185,7 +185,7 @@ def axis_of(settings: SharedSettings, measurement: Measurement) -> Axis | None:
 
     The direction of a planar flow, and an axis whose standard deviations are 0, are as given.
     """
-    symmetry = symmetry_asked(settings, measurement)
+    symmetry = symmetry_of(settings, measurement)
     if symmetry is None:
         return None
     mm = settings.axis_sigma_mm

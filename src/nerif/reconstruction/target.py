@@ -55,7 +55,7 @@ class Part:
         return r if math.isinf(self.outlier) else r * (self.outlier / r.detach().abs().clamp(min=self.outlier)).sqrt()
 
     @property
-    def of_nothing(self) -> Float[Tensor, "n c"]:
+    def ambient_residual(self) -> Float[Tensor, "n c"]:
         """The scaled residual of the ambient field."""
         return self.residual(self.measured.new_zeros(len(self), self.model.integrals or self.measured.shape[1]))
 
@@ -111,7 +111,7 @@ class Target:
             noise = sigma if observation.sigma is None else noise  # of bins: by their number of pixels
             inverse = torch.ones_like(measured) if noise is None else 1 / noise
             parts.append(Part(forward, rays, measured, inverse))
-        empty = torch.cat([p.of_nothing.flatten() for part in parts for p in part.split()])
+        empty = torch.cat([p.ambient_residual.flatten() for part in parts for p in part.split()])
         chi_square = float(empty.square().mean()) or 1.0  # for data that are all 0
         unit = 1 / math.sqrt(chi_square)
         parts = [replace(p, inverse_scale=p.inverse_scale * unit) for p in parts]
@@ -172,5 +172,5 @@ def _noise_share(parts: list[Part], chi_square: float) -> float:
         return 1 / chi_square
     numbers = sum(part.measured.numel() for part in parts)
     noise = sum(math.erf(part.model.outlier / math.sqrt(2)) * part.measured.numel() for part in parts)
-    empty = sum(float(p.of_nothing.square().sum()) for part in parts for p in part.split())
+    empty = sum(float(p.ambient_residual.square().sum()) for part in parts for p in part.split())
     return noise / chi_square / (empty or numbers)

@@ -10,7 +10,7 @@ import numpy as np
 from nerif.analysis.metrics import LEVELS
 from nerif.data.volume import Volume
 from nerif.geometry import Camera
-from nerif.plotting.drawing import COLOURS, drawn_of, label_of, shown
+from nerif.plotting.drawing import COLOURS, label_of, plotted_quantities, plotted_values
 from nerif.reconstruction.uncertainty.bootstrap import TAILS
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ TERMS = {
 """Labels of the terms of the loss."""
 NOT_DRAWN = {
     "step", "epoch", "seconds", "rays_per_second", "learning_rate", "samples", "weight", "voxels", "iteration",
-    "taken_back", "fit_step", "bin_edge", "withheld_residual",
+    "rolled_back", "fit_step", "bin_edge", "withheld_residual",
 }  # fmt: skip
 LONGEST_SHIFT = 0.25  # as drawn, of the extent of the rig
 BAND_SIGMAS = TAILS["p95"]  # on either side of a band of 90 %
@@ -133,7 +133,7 @@ def draw_residuals(axes: Axes, residuals: np.ndarray) -> Axes:
 
 def banded(volumes: Mapping[str, Volume]) -> list[str]:
     """Return the quantities that have standard deviations."""
-    return [quantity for quantity in drawn_of(volumes) if f"{quantity}_std" in volumes]
+    return [quantity for quantity in plotted_quantities(volumes) if f"{quantity}_std" in volumes]
 
 
 def draw_bands(axes: Axes, volumes: Mapping[str, Volume], quantity: str) -> Axes:
@@ -145,7 +145,7 @@ def draw_bands(axes: Axes, volumes: Mapping[str, Volume], quantity: str) -> Axes
     quantity : one of `banded`
     """
     volume = volumes[quantity]
-    values, std = shown(volume), volumes[f"{quantity}_std"].values.double().numpy()
+    values, std = plotted_values(volume), volumes[f"{quantity}_std"].values.double().numpy()
     ends = [volumes.get(f"{quantity}_{name}") for name in ("p05", "p95")]
     low, high = (
         values + sign * BAND_SIGMAS * std if end is None else end.values.double().numpy()

@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from nerif import __version__
-from nerif.analysis.evaluation import rms_text
+from nerif.analysis.evaluation import rms_with_unit
 from nerif.common.files import atomic
 from nerif.data.meridian import Meridian
 from nerif.data.volume import name_of
 from nerif.forward.registry import technique_of
-from nerif.plotting.drawing import drawn_of, map_colours
+from nerif.plotting.drawing import map_colours, plotted_quantities
 from nerif.plotting.notebook import image, number
 from nerif.report import figures, summary
 from nerif.report.meridian_figure import draw_centre_line, draw_profiles, draw_section
@@ -75,7 +75,7 @@ def render(result: Result) -> str:
         curves=_curves(result),
         assumptions=[
             (name_of(q).capitalize(), result.volumes[q].notes)
-            for q in drawn_of(result.volumes)
+            for q in plotted_quantities(result.volumes)
             if "assumption" in result.volumes[q].notes
         ],
         trials=result.metrics.get("uncertainty"),
@@ -108,7 +108,7 @@ def _template() -> jinja2.Template:
     environment.filters["number"] = number
     environment.filters["gradient"] = lambda limits: _gradient(map_colours(limits))
     environment.filters["ends"] = _ends
-    environment.filters["rms"] = partial(rms_text, digits=3)
+    environment.filters["rms"] = partial(rms_with_unit, digits=3)
     return environment.get_template("report.html.j2")
 
 
@@ -121,7 +121,7 @@ def _plane(meridian: Meridian | None) -> list[tuple[str, str]]:
     plots = (plane, draw_section), (across, draw_profiles), (along, draw_centre_line)
     return [
         (f"{name_of(quantity).capitalize()} {where}", svg(partial(draw, meridian=meridian, quantity=quantity)))
-        for quantity, (where, draw) in itertools.product(drawn_of(meridian.quantities), plots)
+        for quantity, (where, draw) in itertools.product(plotted_quantities(meridian.quantities), plots)
     ]
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from nerif.data.volume import Volume
-from nerif.plotting.drawing import colour_range, shown
+from nerif.plotting.drawing import colour_range, plotted_values
 
 if TYPE_CHECKING:
     from mpl_toolkits.mplot3d import Axes3D
@@ -21,7 +21,7 @@ FACE = "#E69F00"
 
 def default_level(volume: Volume) -> float:
     """Return the value halfway between the ambient (median on the faces) and the extreme, outliers excluded."""
-    values = shown(volume)
+    values = plotted_values(volume)
     faces = np.concatenate([np.take(values, i, axis=a).ravel() for a in range(3) for i in (0, -1)])
     ambient = float(np.nanmedian(faces)) if np.isfinite(faces).any() else 0.0
     return ambient + 0.5 * max((end - ambient for end in colour_range(values)), key=abs)
@@ -32,7 +32,7 @@ def surface_triangles(volume: Volume, level: float) -> Float[np.ndarray, "n 3 3"
     from skimage.measure import marching_cubes
 
     stride = max(1, -(-max(volume.grid.shape) // MAX_VOXELS))
-    values = filled(shown(volume)[::stride, ::stride, ::stride])
+    values = filled(plotted_values(volume)[::stride, ::stride, ::stride])
     if min(values.shape) < 2 or not values.min() < level < values.max():
         return np.zeros((0, 3, 3))
     vertices, faces, _, _ = marching_cubes(values, level)
@@ -62,7 +62,7 @@ def filled(values: Float[np.ndarray, "z y x"]) -> Float[np.ndarray, "z y x"]:
 
 
 def draw_isosurface(axes: Axes3D, volume: Volume, level: float) -> Axes3D:
-    """Draw an isosurface (level in the unit shown), lit from the viewer; lengths in mm."""
+    """Draw an isosurface (level in the plotted unit), lit from the viewer; lengths in mm."""
     from matplotlib.colors import LightSource
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 

@@ -15,10 +15,10 @@ from nerif.common.files import atomic
 from nerif.common.installation import install
 from nerif.data.volume import Volume, field_of
 from nerif.data.volume_sequence import VolumeSequence
-from nerif.plotting.drawing import COLOUR_MAPS, LABELS, SEQUENTIAL, colour_range, shown
+from nerif.plotting.drawing import COLOUR_MAPS, LABELS, SEQUENTIAL, colour_range, plotted_values
 from nerif.report.isosurface import default_level, filled
 
-__all__ = ["STYLES", "Movie", "frames_there", "ranges_over_time"]
+__all__ = ["STYLES", "Movie", "finished_frames", "ranges_over_time"]
 
 STYLES = ("isosurface", "slices")
 FORMATS = (".mp4", ".gif")
@@ -33,7 +33,7 @@ class Movie:
     ----------
     style : isosurface or slices (three, through the centre of the box)
     quantity : drawn; "" for density or, of another field than the index, the field
-    level : of the isosurface, in the unit shown; None for halfway between the ambient and the extreme
+    level : of the isosurface, in the plotted unit; None for halfway between the ambient and the extreme
     size : width and height, px
     azimuth, elevation : of the viewpoint, degrees
     frames_per_second : of the movie
@@ -159,12 +159,12 @@ def ranges_over_time(
 ) -> tuple[tuple[float, float], float]:  # fmt: skip
     """Return colour range and isosurface level for all frames, from a sample of about eight."""
     sample = [store.volume(i, quantity) for i in frames[:: max(1, len(frames) // 8)]]
-    ends = [colour_range(shown(v)) for v in sample]
+    ends = [colour_range(plotted_values(v)) for v in sample]
     limits = min(low for low, _ in ends), max(high for _, high in ends)
     return limits, float(np.median([default_level(v) for v in sample]))
 
 
-def frames_there(store: VolumeSequence) -> list[int]:
+def finished_frames(store: VolumeSequence) -> list[int]:
     """Return the available frames: all of a store without status, else the finished ones."""
     if "status" not in store.group:
         return list(range(len(store)))
@@ -172,10 +172,10 @@ def frames_there(store: VolumeSequence) -> list[int]:
 
 
 def _points(volume: Volume, name: str) -> Any:
-    """Voxel centres with the values shown, NaN where masked, and the mask as 1 and 0 under MASKED."""
+    """Voxel centres with the plotted values, NaN where masked, and the mask as 1 and 0 under MASKED."""
     import pyvista as pv
 
-    values = shown(volume)
+    values = plotted_values(volume)
     origin = [float(volume.grid.axis(a)[0]) for a in "xyz"]
     grid = pv.ImageData(dimensions=volume.grid.shape[::-1], spacing=volume.grid.spacing, origin=origin)
     grid[name] = values.ravel()

@@ -19,7 +19,15 @@ from nerif.data.measurement import Observation
 from nerif.data.reprojection import Reprojection
 from nerif.data.volume import INDEX, Volume
 from nerif.plotting import drawing
-from nerif.plotting.drawing import add_colour_bar, colour_range, draw_map, drawn_of, label_of, map_range, shown
+from nerif.plotting.drawing import (
+    add_colour_bar,
+    colour_range,
+    draw_map,
+    label_of,
+    map_range,
+    plotted_quantities,
+    plotted_values,
+)
 from nerif.report import figures
 from nerif.report.isosurface import default_level, draw_isosurface
 from nerif.report.meridian_figure import draw_centre_line, draw_profiles, draw_section
@@ -60,7 +68,7 @@ def save_figures(result: Result, directory: Path, journal: str = "elsevier", dpi
 
 def figures_of(result: Result, single: float, double: float) -> Iterator[tuple[str, Figure]]:
     """Draw the figures one by one, with their names; `single` and `double` are column widths, mm."""
-    metrics, quantities = result.metrics, drawn_of(result.volumes)
+    metrics, quantities = result.metrics, plotted_quantities(result.volumes)
 
     def plot(height_over_width: float, draw: Callable[..., object], *data: Any) -> Figure:
         figure = _page(single, height_over_width)
@@ -78,7 +86,7 @@ def figures_of(result: Result, single: float, double: float) -> Iterator[tuple[s
         yield f"isosurface_{quantity}", isosurface(result.volumes[quantity], single)
     if (meridian := result.meridian) is not None:
         plots = ("section", draw_section), ("profiles", draw_profiles), ("centre_line", draw_centre_line)
-        for quantity, (name, draw) in itertools.product(drawn_of(meridian.quantities), plots):
+        for quantity, (name, draw) in itertools.product(plotted_quantities(meridian.quantities), plots):
             yield f"{name}_{quantity}", plot(0.9 if name == "section" else 0.7, draw, meridian, quantity)
     if result.reprojection is not None:
         used: set[str] = set()
@@ -120,7 +128,7 @@ def slices(volume: Volume, width: float, std: Volume | None = None) -> Figure:
     ratios = [ex, ex, ey]
     figure = _page(width, max(0.2, 0.80 * max(ey, ez) / sum(ratios)) + 0.06)
     row = figure.subplots(1, 3, gridspec_kw={"width_ratios": ratios})
-    low, high = limits = colour_range(shown(volume))
+    low, high = limits = colour_range(plotted_values(volume))
     doubtful = None if std is None else std.values.double().numpy() > HATCHED_STD * (high - low)
     drawing.draw_slices(row, volume, limits, doubtful=doubtful)
     add_colour_bar(row, label_of(volume.quantity))
@@ -231,7 +239,7 @@ def rig(reprojection: Reprojection, width: float) -> Figure:
 def comparison(field: Volume, error: Volume, width: float) -> Figure:
     """Draw middle slices of reconstruction, truth and error."""
     truth = replace(field, values=field.values - error.values)
-    limits = colour_range(shown(truth))
+    limits = colour_range(plotted_values(truth))
     largest = float(error.values.abs().max()) or 1.0
     ex, ey, ez = field.grid.box.edges
     figure = _page(width, max(0.3, 2.7 * max(ey, ez) / (2 * ex + ey)) + 0.08)

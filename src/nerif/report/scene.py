@@ -13,7 +13,15 @@ from nerif.data.volume import INDEX, Volume, field_of, name_of, quantities_of
 from nerif.data.volume_sequence import VolumeSequence
 from nerif.geometry import Grid
 from nerif.physics.quantities import GasSettings, derive
-from nerif.plotting.drawing import COLOUR_MAPS, DIVERGING, LABELS, SEQUENTIAL, colour_range, drawn_of, shown
+from nerif.plotting.drawing import (
+    COLOUR_MAPS,
+    DIVERGING,
+    LABELS,
+    SEQUENTIAL,
+    colour_range,
+    plotted_quantities,
+    plotted_values,
+)
 from nerif.report import packing
 from nerif.report.isosurface import default_level
 from nerif.report.pages import error_of
@@ -28,7 +36,7 @@ MAX_FRAME_VOXELS = 48  # along the longest edge; the page of a sequence has doze
 
 def scene_of(result: Result) -> tuple[dict[str, Any] | None, dict[str, str]]:
     """Return the scene of a result, and its packed arrays by name."""
-    field, quantities = result.field, drawn_of(result.volumes)
+    field, quantities = result.field, plotted_quantities(result.volumes)
     if field is None or (field.quantity == INDEX and field.n_ambient is None) or not quantities:
         return None, {}
     small = packing.coarsen(field)
@@ -70,10 +78,10 @@ def scene_over_time(store: VolumeSequence, frames: list[int]) -> tuple[dict[str,
     packed = [packing.pack(v.values.double().numpy(), packing.COARSE) for v in small]
     gas = GasSettings(**store.attributes["gas"]) if "gas" in store.attributes else None
     quantities = {}
-    names = drawn_of(quantities_of(field))
+    names = plotted_quantities(quantities_of(field))
     for name in names if gas is not None else names[:1]:
         sample = [derive(v, name, gas or GasSettings()) for v in small[:: max(1, len(small) // 8)]]
-        ends = [colour_range(shown(v)) for v in sample]
+        ends = [colour_range(plotted_values(v)) for v in sample]
         quantities[name] = {
             **_quantity(name, sample[0], float(np.median([default_level(v) for v in sample]))),
             "range": [min(e[0] for e in ends), max(e[1] for e in ends)],

@@ -15,7 +15,7 @@ from nerif.data.volume_sequence import ViewScores, VolumeSequence
 from nerif.forward.registry import technique, technique_of
 from nerif.plotting.notebook import number
 from nerif.report.html import flat, render_page, svg
-from nerif.report.movie import frames_there
+from nerif.report.movie import finished_frames
 from nerif.report.scene import scene_over_time
 from nerif.report.summary import Statement
 
@@ -29,7 +29,7 @@ MAX_FRAMES = 60  # on the page
 
 def render_sequence(store: VolumeSequence) -> str:
     """Return the page of a sequence, complete or not."""
-    frames = frames_there(store)
+    frames = finished_frames(store)
     if not frames:
         raise InputError("expected at least one finished frame, got none; run nerif sequence again", field=store.path)
     field = field_of(store.quantities)

@@ -8,17 +8,17 @@ from typing import Any
 
 import numpy as np
 
-from nerif.analysis.evaluation import rms_text
+from nerif.analysis.evaluation import rms_with_unit
 from nerif.analysis.residuals import CAUSES
 from nerif.analysis.verdict import correlated_share, verdict
 from nerif.common.conventions import with_unit
 from nerif.data.volume import INDEX, field_of, name_of
 from nerif.forward.registry import TECHNIQUES
 from nerif.physics.quantities import TEMPERATURE_RANGE
-from nerif.plotting.drawing import LABELS, drawn_of, shown
+from nerif.plotting.drawing import LABELS, plotted_quantities, plotted_values
 from nerif.plotting.notebook import number, percent, span
 from nerif.reconstruction.files import FIELD
-from nerif.reconstruction.rig.parameters import moved_lines
+from nerif.reconstruction.rig.parameters import refinement_lines
 from nerif.report.packing import relation
 from nerif.results.directory import METRICS, VOLUME, Result
 
@@ -65,11 +65,11 @@ def measurement_rows(result: Result) -> Rows:
 def field_rows(result: Result) -> Rows:
     """Return names and values of the reconstruction: method, ranges of the quantities, cost."""
     rows = [("Method", result.method)]
-    for quantity in drawn_of(result.volumes):
+    for quantity in plotted_quantities(result.volumes):
         volume = result.volumes[quantity]
         name, unit = LABELS.get(quantity, (quantity, volume.unit))
         digits = 4 if quantity == "temperature" else 3
-        rows.append((name if quantity == "n" else name.capitalize(), span(shown(volume), unit, digits)))
+        rows.append((name if quantity == "n" else name.capitalize(), span(plotted_values(volume), unit, digits)))
     ambient = _ambient_temperature(result)
     if ambient is not None:
         rows.append(("Ambient temperature, implied", f"{ambient:.1f} K"))
@@ -141,7 +141,7 @@ def accuracy_rows(result: Result) -> Rows:
 def _scores(views: list[View]) -> str:
     """The worst scores of some views."""
     cc, noise = _extreme(views, "cc", min), _extreme(views, "rms_over_sigma")
-    rms = rms_text(max(views, key=lambda v: v.get("rms") or 0.0), 3)
+    rms = rms_with_unit(max(views, key=lambda v: v.get("rms") or 0.0), 3)
     least, most = ("at least ", "at most ") if len(views) > 1 else ("", "")
     return f"CC {least}{number(cc, 5)}, rms error {most}{rms}{'' if noise is None else f' = {noise:.2f} σ'}"
 
@@ -309,7 +309,7 @@ def _of_rig(result: Result) -> list[Statement]:
     table = result.metrics.get("rig")
     if not table:
         return []
-    first, *lines = moved_lines(table)
+    first, *lines = refinement_lines(table)
     remarks = [Statement("note", f"Camera refinement: {first}.")]
     return remarks + [Statement("warning", f"{line[0].upper()}{line[1:]}.") for line in lines]
 

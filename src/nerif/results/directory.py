@@ -36,7 +36,7 @@ __all__ = [
 
 RUN, METRICS, HISTORY, REPORT = "run.toml", "metrics.json", "history.csv", "report.html"
 VOLUME, VOLUME_VTI, REPROJECTION = "volume.nc", "volume.vti", "reprojection.nc"
-MERIDIAN, LIVE, LIVE_LOOK = ("meridian.nc", "meridian.csv"), "live.json", "live.npz"
+MERIDIAN, LIVE, LIVE_FIELD = ("meridian.nc", "meridian.csv"), "live.json", "live.npz"
 TRIALS, CROSS_VALIDATION, FIGURES, CALIBRATION = "trials", "cross_validation", "figures", "calibration.toml"
 FILES = (RUN, METRICS, HISTORY, FIELD, CHECKPOINT, VOLUME, VOLUME_VTI, REPROJECTION, REPORT, CALIBRATION)
 
@@ -102,7 +102,7 @@ class Result:
     def meridian(self) -> Meridian | None:
         """The quantities of a symmetric flow over (r, h); None for other flows."""
         axis = self.metrics.get("axis") if self.volumes else None
-        return Meridian.of(self.volumes, Symmetry.kept(axis["symmetry"])) if axis else None
+        return Meridian.of(self.volumes, Symmetry.from_entries(axis["symmetry"])) if axis else None
 
     @property
     def method(self) -> str:
@@ -155,7 +155,7 @@ class ResultDirectory:
 
         A foreign calibration is renamed only when one is written.
         """
-        names = (*FILES, *MERIDIAN, LIVE, LIVE_LOOK)
+        names = (*FILES, *MERIDIAN, LIVE, LIVE_FIELD)
         self.files.remove(names)
         self.files.set_aside([name for name in names if name != CALIBRATION])
         if self.has(CALIBRATION):

@@ -32,7 +32,7 @@ from nerif.geometry import Box, Grid
 from nerif.reconstruction.base import OnStep, Reconstructor, Step, compose
 from nerif.reconstruction.progress import Monitor
 from nerif.reconstruction.uncertainty.bootstrap import best_covered
-from nerif.results.directory import LIVE, LIVE_LOOK
+from nerif.results.directory import LIVE, LIVE_FIELD
 
 __all__ = ["Live", "Look", "read_live", "read_look"]
 
@@ -176,7 +176,7 @@ class Live:
             observation, forward = model
             arrays["measured"], arrays["predicted"] = self._maps(field, observation, forward)
             about |= {"view": self.view, "components": observation.components, "unit": observation.technique.unit}
-        with OwnFiles(self.directory).writing(LIVE_LOOK) as path, atomic(path) as part:
+        with OwnFiles(self.directory).writing(LIVE_FIELD) as path, atomic(path) as part:
             np.savez(part, about=np.array(json.dumps(about)), **arrays)  # type: ignore[arg-type]
 
     def _integral(self) -> tuple[Observation, ForwardModel] | None:
@@ -216,7 +216,7 @@ def read_live(directory: Path) -> dict[str, Any]:
 
 def read_look(directory: Path) -> Look | None:
     """Return the content of live.npz of a result directory; None if there is none."""
-    path = directory / LIVE_LOOK
+    path = directory / LIVE_FIELD
     if not path.is_file():
         return None
     with np.load(path, allow_pickle=False) as file:

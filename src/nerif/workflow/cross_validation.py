@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from nerif.analysis.asymmetry import HALVES, withhold_half
-from nerif.analysis.evaluation import evaluate_views, rms_text
+from nerif.analysis.evaluation import evaluate_views, rms_with_unit
 from nerif.analysis.prediction import reproject
 from nerif.common.conventions import InputError
 from nerif.common.files import write_json
@@ -117,7 +117,7 @@ class CrossValidation:
         with self._directory.writing(SCORES) as path:
             write_json(path, entries)
         for v in views:
-            say(f"cross-validation: withheld view {name} predicted with CC {v['cc']:.4f}, rms error {rms_text(v)}")
+            say(f"cross-validation: withheld view {name} predicted with CC {v['cc']:.4f}, rms error {rms_with_unit(v)}")
         return result
 
     def scores(self) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from nerif.data.measurement import Measurement
 from nerif.data.volume import quantities_of
 from nerif.fields.base import Field
 from nerif.physics.quantities import GasSettings
-from nerif.reconstruction.aperture import seen_through
+from nerif.reconstruction.aperture import apply_aperture
 from nerif.reconstruction.base import OnStep, Reconstruction, Reconstructor, State, Step
 from nerif.reconstruction.files import CHECKPOINT, FIELD
 from nerif.reconstruction.methods import method_name
@@ -63,12 +63,12 @@ class Run:
         check_settings(self)
 
 
-def remedy(out: ResultDirectory, own: bool) -> str:
-    """Return what an interrupted run has saved, and how to continue; `own`: the directory holds files of this run."""
+def remedy(out: ResultDirectory, own_files: bool) -> str:
+    """Return what an interrupted run (with own files in the directory or not) has saved, and how to continue."""
     resume = f"nerif reconstruct --resume --out {out.path}"
-    if own and out.has(FIELD):
+    if own_files and out.has(FIELD):
         return f"{out.path} holds the field, but not all other files; complete it with {resume}"
-    if own and (out.has(CHECKPOINT) or out.cross_validation.has(CHECKPOINT) or out.cross_validation.has(FIELD)):
+    if own_files and (out.has(CHECKPOINT) or out.cross_validation.has(CHECKPOINT) or out.cross_validation.has(FIELD)):
         return f"{out.path} holds the last checkpoint; continue with {resume}"
     return "nothing was saved yet; run the same command again"
 
@@ -102,7 +102,7 @@ class Inputs:
         path = None if isinstance(measurement, Measurement) else Path(measurement)
         if not isinstance(measurement, Measurement):
             measurement = Measurement.read(measurement)
-        all_views = seen_through(measurement, reconstructor.aperture)
+        all_views = apply_aperture(measurement, reconstructor.aperture)
         check_source(reconstructor.source, all_views)  # before any view is withheld
         measurement, reconstructor, withheld = with_halves(run.withhold, all_views, reconstructor)
         training = measurement.without(withheld)

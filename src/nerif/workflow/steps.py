@@ -21,7 +21,7 @@ from nerif.physics.quantities import NOT_UNIFORM, masked_lines
 from nerif.reconstruction.base import Reconstruction, compose
 from nerif.reconstruction.files import FIELD, checkpoints
 from nerif.reconstruction.neural.neural import NeRIF
-from nerif.reconstruction.rig.parameters import moved_lines, with_corrections
+from nerif.reconstruction.rig.parameters import refinement_lines, with_corrections
 from nerif.reconstruction.rig.posterior import with_posterior
 from nerif.reconstruction.rig.refinement import refit
 from nerif.results.directory import CALIBRATION, versions
@@ -141,7 +141,7 @@ class WriteRig(PipelineStep):
         out.add_metrics({"rig": rig})
         with out.writing(CALIBRATION) as path:
             write_cameras(path, [CalibratedCamera.from_camera(c) for c in job.measurement.cameras])
-        for line in moved_lines(rig):
+        for line in refinement_lines(rig):
             monitor.say(line)
         if not job.withheld:
             return

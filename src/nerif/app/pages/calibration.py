@@ -1,4 +1,4 @@
-"""Calibration: cameras from images of a target, or one from a ruler; what was found, how well it fits, the rig."""
+"""Calibration: cameras from images of a target, or one from a ruler; detected corners, errors, the rig."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from nicegui import ui
 
 from nerif.app.form_view import FormView
 from nerif.app.forms import Form
-from nerif.app.job_told import JobTold
+from nerif.app.job_status import JobStatus
 from nerif.app.jobs import Job
 from nerif.app.pages.page import Page
 from nerif.app.pieces import CommandLine, card, refusals, text_html
@@ -53,26 +53,26 @@ def form_of(simple: bool, settings: dict[str, Any] | None = None) -> Form[Calibr
 class CalibrationPage:
     """The page in one tab."""
 
-    def __init__(self, work: Workspace, found: Contents) -> None:
-        self.work, self.found = work, found
-        kept = work.draft(PAGE.name)
-        self.kept = dict(kept)
-        self.left_out: dict[str, list[str]] = {k: list(v) for k, v in kept.get("leave_out", {}).items()}
-        self.values: dict[str, dict[str, Any]] = {name: dict(kept.get(name, {})) for name in ("target", "ruler")}
+    def __init__(self, work: Workspace, outcome: Contents) -> None:
+        self.work, self.outcome = work, outcome
+        memory = work.draft(PAGE.name)
+        self.memory = dict(memory)
+        self.left_out: dict[str, list[str]] = {k: list(v) for k, v in memory.get("leave_out", {}).items()}
+        self.values: dict[str, dict[str, Any]] = {name: dict(memory.get(name, {})) for name in ("target", "ruler")}
         self.views: dict[str, View] = {}
         self.errors: dict[str, ImageError] = {}
         self.turn = 0  # of drawing the rig
-        self.seen: tuple[Any, ...] = ()
-        experiments = list(found.experiments)
-        known = kept.get("experiment")
+        self.visible: tuple[Any, ...] = ()
+        experiments = list(outcome.experiments)
+        available = memory.get("experiment")
         with ui.element("div").classes("columns"):
             with card("Calibrate"), ui.element("div").classes("form"):
                 if not experiments:
                     text_html("There are no images in this folder yet; the page Images says where they go.")
-                first = known if known in experiments else next(iter(experiments), None)
+                first = available if available in experiments else next(iter(experiments), None)
                 self.experiment = self._select("Experiment", experiments, first)
-                self.way = self._select("From", WAYS, bool(kept.get("simple", False)))
-                self.out = ui.input("Calibration to write", value=str(kept.get("out", "calibration.toml")))
+                self.way = self._select("From", WAYS, bool(memory.get("simple", False)))
+                self.out = ui.input("Calibration to write", value=str(memory.get("out", "calibration.toml")))
                 self.out.props("outlined dense debounce=250").props["aria-label"] = "Calibration to write"
                 self.out.on_value_change(self._show)
                 self.note = ui.element("div")
@@ -82,12 +82,12 @@ class CalibrationPage:
             with ui.element("div").classes("stack"):
                 with card("The same on the command line"):
                     self.command = CommandLine()
-                    self.told = JobTold(work, f"{PAGE.name}.run", self._ended)
+                    self.notice = JobStatus(work, f"{PAGE.name}.run", self._ended)
                 with card("The rig"):
-                    self.calibration = self._select("Calibration", list(found.calibrations), None)
+                    self.calibration = self._select("Calibration", list(outcome.calibrations), None)
                     self.rig = ui.element("div").classes("rig")
-                with card("Images of the target", "Circles: points found, the first one filled. What is left out is "
-                          "part of the command line; calibrate again after it."):  # fmt: skip
+                with card("Images of the target", "Circles: detected points, the first one filled. "
+                          "Left-out images are part of the command line; calibrate again after it."):  # fmt: skip
                     self.view = self._select("View", [], None)
                     self.images = TargetImages(work, self._toggled)
 
@@ -126,8 +126,8 @@ class CalibrationPage:
         self.views = {}
         if self.experiment.value:
             with refusals():
-                found = await self.work.beside(self.work.project.views, self.experiment.value)
-                self.views = {view.name: view for view in found}
+                outcome = await self.work.beside(self.work.project.views, self.experiment.value)
+                self.views = {view.name: view for view in outcome}
         settings: dict[str, Any] = {}
         if self.settings:
             with refusals():
@@ -140,8 +140,8 @@ class CalibrationPage:
             values = self.values["ruler" if self.simple else "target"]
             self.form = FormView(form, self._show, values, SIMPLE_MAIN if self.simple else MAIN)
         named = list(self.views)
-        kept = self.kept.get("view")
-        self.view.set_options(named, value=kept if kept in named else next(iter(named), None))
+        memory = self.memory.get("view")
+        self.view.set_options(named, value=memory if memory in named else next(iter(named), None))
         self._show()
 
     @property
@@ -168,11 +168,11 @@ class CalibrationPage:
         if not hasattr(self, "form"):
             return
         self.values["ruler" if self.simple else "target"] = self.form.form.changed(self.form.values)
-        self.kept = {
+        self.memory = {
             "experiment": self.experiment.value, "simple": self.simple, "out": self.out.value, "view": self.view.value,
             "leave_out": self.left_out, "calibration": self.calibration.value, **self.values,
         }  # fmt: skip
-        self.work.keep(PAGE.name, self.kept)
+        self.work.keep(PAGE.name, self.memory)
         self.command.show(self.arguments())
         notes = [f"Its settings are those of {self.settings}, but for what is changed here."] if self.settings else []
         notes += [f"{self.out.value} is there; it is replaced."] if self._exists() else []
@@ -180,7 +180,7 @@ class CalibrationPage:
         with self.note:
             for text in notes:
                 text_html(text, classes="note")
-        self.start.set_enabled(bool(self.experiment.value and self.out.value) and self.form.right)
+        self.start.set_enabled(bool(self.experiment.value and self.out.value) and self.form.valid)
 
     def _toggled(self, name: str) -> None:
         left = self.left
@@ -194,39 +194,39 @@ class CalibrationPage:
 
     def _start(self) -> None:
         with refusals():
-            self.form.made()
+            self.form.record()
             self.work.project.path(self.out.value).parent.mkdir(parents=True, exist_ok=True)
-            self.told.follow(self.work.jobs.add(self.arguments(), f"Calibrate {self.experiment.value}"))
+            self.notice.follow(self.work.jobs.add(self.arguments(), f"Calibrate {self.experiment.value}"))
 
     async def _ended(self, job: Job) -> None:
         """Show what the run wrote."""
         if job.state == "done":
-            self.found = await self.work.beside(self.work.project.contents)
+            self.outcome = await self.work.beside(self.work.project.contents)
             await self._choose_calibration(self.work.project.relative(job.file))
             await self._draw()
         self._show()
 
-    # -- what came out -------------------------------------------------------------------------------------------
+    # -- results -------------------------------------------------------------------------------------------
 
     async def _choose_calibration(self, name: str | None = None) -> None:
-        names = sorted(self.found.calibrations, key=lambda n: (n.count("/"), n))
-        best = [n for n in (name, self.calibration.value, self.kept.get("calibration"), self.out.value) if n in names]
+        names = sorted(self.outcome.calibrations, key=lambda n: (n.count("/"), n))
+        best = [n for n in (name, self.calibration.value, self.memory.get("calibration"), self.out.value) if n in names]
         self.calibration.set_options(names, value=next(iter([*best, *names]), None))
 
     async def _draw(self) -> None:
         """Show the rig of the calibration that is chosen, and its errors beside the images."""
         self.turn += 1
         turn, name, rig = self.turn, self.calibration.value, None
-        said = [] if name else ["There is no calibration in this folder yet."]
+        lines = [] if name else ["There is no calibration in this folder yet."]
         if name:
-            with refusals(said.append):
+            with refusals(lines.append):
                 rig = await self.work.beside(read_rig, self.work.project.path(name))
         if turn != self.turn:  # another one has been chosen meanwhile
             return
         self.errors = {error.name: error for error in rig.errors} if rig else {}
         self.rig.clear()
         with self.rig:
-            for text in said:
+            for text in lines:
                 text_html(text, classes="note")
             if rig:
                 show_rig(rig)
@@ -236,24 +236,24 @@ class CalibrationPage:
     async def _images(self) -> None:
         """Show the images of the view that is chosen."""
         view = self.views.get(self.view.value or "")
-        if view is None or not self.form.right:
+        if view is None or not self.form.valid:
             return
         self._show()
         with refusals():
-            targets, self.seen = self._targets(), self._wanted()
+            targets, self.visible = self._targets(), self._wanted()
             await self.images.show(view, targets, self.errors, self.left)
 
     def _targets(self) -> dict[str, CalibrationTarget]:
         """What is looked for; a ruler needs none, then it is that of the form's defaults."""
-        made = form_of(False).record if self.simple else self.form.made()
+        made = form_of(False).record if self.simple else self.form.record()
         return {"target": made.target, "background": made.target.scaled(made.background_scale)}
 
     def _wanted(self) -> tuple[Any, ...]:
         return self.experiment.value, self.view.value, *self._targets().values()
 
     async def _look_again(self) -> None:
-        """Look anew after another target has been typed, or another experiment chosen."""
-        if self.form.right and self._wanted() != self.seen:
+        """Detect again with another target or another experiment."""
+        if self.form.valid and self._wanted() != self.visible:
             await self._images()
 
 

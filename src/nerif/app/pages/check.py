@@ -13,7 +13,7 @@ from nerif.app.file_choice import FileChoice
 from nerif.app.form_view import FormView
 from nerif.app.forms import Form
 from nerif.app.job_form import JobForm
-from nerif.app.job_told import JobTold
+from nerif.app.job_status import JobStatus
 from nerif.app.pages.page import Page
 from nerif.app.pieces import CommandLine, card, refusals, text_html
 from nerif.app.workspace import Workspace
@@ -25,7 +25,7 @@ __all__ = ["PAGE"]
 AGREE = "Each is predicted by a quick reconstruction from the others."
 REFINE = "Cameras are refined with a quick field: which one is off?"
 COMPARED = ("voxels", "aperture")
-REFINED_LINES = 60  # of what it finds: a table of the views, and what is odd
+REFINED_LINES = 60  # of its output: a table of the views and the findings
 REFINED = ("pose_sigma_mm", "pose_sigma_deg", "time_limit", "aperture")
 
 
@@ -40,31 +40,31 @@ class CheckPage:
 
     def __init__(self, work: Workspace, measurements: Sequence[str]) -> None:
         self.work = work
-        kept = work.draft(PAGE.name)
+        memory = work.draft(PAGE.name)
         with ui.element("div").classes("columns"):
             with ui.element("div").classes("stack"):
                 with card("Do the views agree?", AGREE), ui.element("div").classes("form"):
                     self.choice = FileChoice(
-                        "Measurement", measurements, kept.get("measurement"), self._there, self._turned
+                        "Measurement", measurements, memory.get("measurement"), self._there, self._turned
                     )
-                    self.form = FormView(Form(self._record(), only=COMPARED), self._changed, kept.get("values"))
+                    self.form = FormView(Form(self._record(), only=COMPARED), self._changed, memory.get("values"))
                     self.button = ui.button("Compare the views", icon="rule", on_click=self.compare)
                     self.button.props("unelevated no-caps")
                 with card("Is the rig as it was calibrated?", REFINE), ui.element("div").classes("form"):
                     record = replace(self._record(), refine=("cameras",))
                     self.rig = JobForm(
-                        work, f"{PAGE.name}.rig", Form(record, only=REFINED), self._refine_words, "Refine and tell",
+                        work, f"{PAGE.name}.rig", Form(record, only=REFINED), self._refine_words, "Refine",
                         lines=REFINED_LINES,
                     )  # fmt: skip
             with ui.element("div").classes("stack"):
                 with card("The same on the command line"):
                     self.command = CommandLine()
-                with card("What was found"):
-                    self.told = ui.element("div").classes("stack").props('aria-live="polite"')
-                    with self.told:
-                        text_html("Nothing has been compared yet.", classes="told")
+                with card("Findings"):
+                    self.notice = ui.element("div").classes("stack").props('aria-live="polite"')
+                    with self.notice:
+                        text_html("The views have not been compared yet.", classes="status")
                 with card("Undone") as self.correction:
-                    self.correcting = JobTold(work, f"{PAGE.name}.undone", offer=self.choice.choose)
+                    self.correcting = JobStatus(work, f"{PAGE.name}.undone", offer=self.choice.choose)
         self.correction.set_visibility(bool(self.correcting.job))
         self.show()
 
@@ -84,7 +84,7 @@ class CheckPage:
     def show(self) -> None:
         """Show the command line as it is now."""
         self.command.show(self.arguments)
-        self.button.set_enabled(self.form.right)
+        self.button.set_enabled(self.form.valid)
 
     def _changed(self) -> None:
         self._keep()
@@ -98,15 +98,15 @@ class CheckPage:
     def _turned(self) -> None:
         self._keep()
         self.correction.set_visibility(bool(self.correcting.job))
-        self.told.clear()
+        self.notice.clear()
         self.show()
         self.rig.show()
 
     async def compare(self) -> None:
-        """Compare the views and show what was found."""
+        """Compare the views and show the findings."""
         name, arguments = self.choice.name, self.arguments
-        self.told.clear()
-        with self.told:
+        self.notice.clear()
+        with self.notice:
             bar = ui.linear_progress(0, show_value=False).props('aria-label="Comparing the views"')
         self.button.disable()
         done = [0.0]
@@ -115,37 +115,37 @@ class CheckPage:
         def step(count: int, total: int) -> None:
             done[0] = count / max(total, 1)
 
-        said: list[str] = []
-        found = None
-        with refusals(said.append):
-            asked = self.form.made()
+        messages: list[str] = []
+        result = None
+        with refusals(messages.append):
+            request = self.form.record()
 
             def work() -> Consistency:
                 measurement = Measurement.read(self.work.project.path(name))
-                return check_consistency(measurement, asked.voxels, step, asked.aperture)
+                return check_consistency(measurement, request.voxels, step, request.aperture)
 
-            found = await self.work.beside(work)
+            result = await self.work.beside(work)
         timer.cancel()
         self.button.enable()
-        self.told.clear()
-        with self.told:
-            for text in said:
-                text_html(text, classes="told")
-            if found is not None:
-                self._show(name, arguments, found)
+        self.notice.clear()
+        with self.notice:
+            for text in messages:
+                text_html(text, classes="status")
+            if result is not None:
+                self._show(name, arguments, result)
 
-    def _show(self, name: str, compared: Sequence[str], found: Consistency) -> None:
+    def _show(self, name: str, compared: Sequence[str], result: Consistency) -> None:
         """The verdicts, and the correction that is offered."""
-        ui.html(views_table(found), sanitize=False)
-        notes = "".join(f"<li>{escape(text)}</li>" for text in found.remarks)
-        findings = "".join(f"<li>{escape(str(finding))}</li>" for finding in found.findings)
+        ui.html(views_table(result), sanitize=False)
+        notes = "".join(f"<li>{escape(text)}</li>" for text in result.remarks)
+        findings = "".join(f"<li>{escape(str(finding))}</li>" for finding in result.findings)
         if findings:
             ui.html(f"<h3>Found</h3><ul class=notes>{findings}</ul>", sanitize=False)
-        elif found.views:
-            text_html("Nothing odd found.", classes="told")
+        elif result.views:
+            text_html("No problems found.", classes="status")
         if notes:
             ui.html(f"<h3>Notes</h3><ul>{notes}</ul>", sanitize=False)
-        if found.corrections:
+        if result.corrections:
             out = self.work.project.free_name(f"{name.removesuffix('.nc')}.corrected.nc")
             arguments = [*compared, "--out", out]
             text_html("The mistakes can be undone, in a new file:", "h3")
@@ -158,21 +158,21 @@ class CheckPage:
                     self.correction.set_visibility(True)
                     button.disable()
 
-            button = ui.button("Undo what was found", icon="auto_fix_high", on_click=correct)
+            button = ui.button("Correct the mistakes", icon="auto_fix_high", on_click=correct)
             button.props("unelevated no-caps")
-        elif found.views and not found.findings:
+        elif result.views and not result.findings:
             link = "<a href='/reconstruct'>Go on to Reconstruct</a>"
             ui.html(f"<p>{link}</p>", sanitize=False)
 
 
-def views_table(found: Consistency) -> str:
+def views_table(result: Consistency) -> str:
     """Return the agreement of every view as HTML; nothing where there are too few views."""
-    if not found.views:
+    if not result.views:
         return ""
     rows = "".join(
         f"<tr><th scope=row>{escape(v.name)}</th><td>{escape(v.measured)}</td><td>{v.valid:.1%}</td>"
         f"<td>{v.agreement:.2f}</td><td>{v.gain:.2f}</td><td>{escape(v.verdict or 'fits')}</td></tr>"
-        for v in found.views
+        for v in result.views
     )
     heads = "".join(f"<th scope=col>{h}</th>" for h in ("View", "Measured", "Valid", "Agreement", "Gain", "Verdict"))
     table = f"<table><thead><tr>{heads}</tr></thead><tbody>{rows}</tbody></table>"
@@ -183,7 +183,7 @@ async def build(work: Workspace) -> None:
     """Build the page."""
     contents = await work.beside(work.project.contents)
     if not contents.measurements:
-        text_html("There is no measurement in the folder yet: Displacement makes one of images.", classes="told")
+        text_html("There is no measurement in the folder yet: Displacement makes one of images.", classes="status")
         return
     CheckPage(work, contents.measurements)
 

@@ -43,7 +43,7 @@ def build(work: Workspace) -> None:
             pass
         with ui.element("div").classes("stack"):
             with card("What to expect"):
-                told = ui.html("", sanitize=False).props('aria-live="polite"')
+                notice = ui.html("", sanitize=False).props('aria-live="polite"')
             with card("From above, to scale"):
                 drawing = ui.html("", sanitize=False).classes("drawing")
             with card("The same on the command line"):
@@ -52,11 +52,11 @@ def build(work: Workspace) -> None:
     def show() -> None:
         work.keep(PAGE.name, form.changed(view.values))
         command.show(view.arguments)
-        if not view.right:
+        if not view.valid:
             return
-        asked = view.made()
-        told.set_content(_told(expect(asked.ring, asked.flow), asked))
-        drawing.set_content(rig_drawing(asked.ring.cameras(), asked.flow.flow_size))
+        request = view.record()
+        notice.set_content(_text(expect(request.ring, request.flow), request))
+        drawing.set_content(rig_drawing(request.ring.cameras(), request.flow.flow_size))
 
     with left:
         view = FormView(form, show, work.draft(PAGE.name), MAIN, SLIDERS)
@@ -69,9 +69,9 @@ def _reset(form: Form[Design], view: FormView[Design]) -> None:
         view.set(name, form.field(name).default)
 
 
-def _told(e: Expectation, asked: Design) -> str:
+def _text(e: Expectation, request: Design) -> str:
     """The figures as HTML: the three that decide, the others, and what looks wrong."""
-    flow = asked.flow
+    flow = request.flow
     first = (
         (f"{e.displacement:.3f} px", f"displacement; noise {flow.displacement_noise:g} px"),
         (f"{math.hypot(e.cone, e.diffraction):.2f} mm", "blur by aperture and diffraction, at the flow"),

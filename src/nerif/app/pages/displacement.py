@@ -37,13 +37,13 @@ class DisplacementPage:
     """
 
     def __init__(self, work: Workspace, contents: Contents) -> None:
-        self.work, kept = work, work.draft(PAGE.name)
+        self.work, memory = work, work.draft(PAGE.name)
         self.measured: MeasurementCard | None = None
         if contents.experiments and contents.calibrations:
             with ui.element("div").classes("columns"):
                 with card("Images to displacements"), ui.element("div").classes("form"):
-                    self.experiment = self._select("Experiment", contents.experiments, kept.get("experiment"))
-                    self.calibration = self._select("Calibration", contents.calibrations, kept.get("calibration"))
+                    self.experiment = self._select("Experiment", contents.experiments, memory.get("experiment"))
+                    self.calibration = self._select("Calibration", contents.calibrations, memory.get("calibration"))
                     self.out = ui.input("Measurement to write", value=work.project.free_name("measurement.nc"))
                     self.out.props('outlined dense aria-label="Measurement to write"')
                     record = Displacement(Path("."), Path("."), Path("measurement.nc"))
@@ -59,11 +59,11 @@ class DisplacementPage:
                     self.view.classes("short")
                     self.button = ui.button("Preview", icon="visibility", on_click=self.preview)
                     self.button.props("outline no-caps")
-                    self.shown = ui.element("div").props('aria-live="polite"')
+                    self.display = ui.element("div").props('aria-live="polite"')
             self._views()
         else:
             lacking = "are no images of an experiment" if not contents.experiments else "is no calibration"
-            text_html(f"There {lacking} in the folder yet; the pages before this one help.", classes="told")
+            text_html(f"There {lacking} in the folder yet; the pages before this one help.", classes="status")
         self.below = ui.element("div").classes("stack")
         self._show(contents.measurements)
 
@@ -79,8 +79,8 @@ class DisplacementPage:
             await self.measured.choice.choose(file)
         self.out.set_value(self.work.project.free_name("measurement.nc"))
 
-    def _select(self, label: str, names: Sequence[str], kept: object) -> ui.select:
-        control = ui.select(list(names), label=label, value=kept if kept in names else names[0])
+    def _select(self, label: str, names: Sequence[str], memory: object) -> ui.select:
+        control = ui.select(list(names), label=label, value=memory if memory in names else names[0])
         control.props["aria-label"] = label
         return control.props("outlined dense options-dense")
 
@@ -91,8 +91,8 @@ class DisplacementPage:
         ]  # fmt: skip
 
     def _turned(self) -> None:
-        chosen = {"experiment": self.experiment.value, "calibration": self.calibration.value}
-        self.work.keep(PAGE.name, {**self.work.draft(PAGE.name), **chosen})
+        selection = {"experiment": self.experiment.value, "calibration": self.calibration.value}
+        self.work.keep(PAGE.name, {**self.work.draft(PAGE.name), **selection})
         self.job.show()
         self._views()
 
@@ -105,29 +105,29 @@ class DisplacementPage:
     async def preview(self) -> None:
         """Find the displacements of one view and show them."""
         self.button.disable()
-        self.shown.clear()
-        with self.shown:
+        self.display.clear()
+        with self.display:
             ui.spinner(size="lg").props('aria-label="Working"')
-        said: list[str] = []
+        lines: list[str] = []
         html = ""
-        with refusals(said.append):
-            asked = replace(
-                self.job.view.made(), folder=self.work.project.path(str(self.experiment.value)),
+        with refusals(lines.append):
+            request = replace(
+                self.job.view.record(), folder=self.work.project.path(str(self.experiment.value)),
                 calibration=self.work.project.path(str(self.calibration.value)), views=(str(self.view.value),),
                 images=False,
             )  # fmt: skip
 
             def work() -> str:
-                numbers = range(asked.frame, asked.frame + asked.average)
-                measurement, _ = measure_instant(asked.recording(), numbers, said.append, processes=1)
+                numbers = range(request.frame, request.frame + request.average)
+                measurement, _ = measure_instant(request.recording(), numbers, lines.append, processes=1)
                 return maps_html(measurement)
 
             html = await self.work.beside(work)
         self.button.enable()
-        self.shown.clear()
-        with self.shown:
-            for text in said:
-                text_html(text, classes="told")
+        self.display.clear()
+        with self.display:
+            for text in lines:
+                text_html(text, classes="status")
             ui.html(html, sanitize=False)
 
 
@@ -142,9 +142,9 @@ class MeasurementCard:
 
     def __init__(self, work: Workspace, measurements: Sequence[str]) -> None:
         self.work = work
-        kept = work.draft(PAGE.name).get("measurement")
+        memory = work.draft(PAGE.name).get("measurement")
         with card("What was measured"):
-            first = kept if kept in measurements else measurements[-1]
+            first = memory if memory in measurements else measurements[-1]
             self.choice = FileChoice("Measurement", measurements, first, self._there, self._turned)
             self.choice.select.classes("short")
             self.fold = ui.expansion("Maps of all views", icon="grid_view", on_value_change=self._maps).classes("wide")
@@ -178,14 +178,14 @@ class MeasurementCard:
         return (name, measurement) if name == self.name else None
 
     async def _maps(self) -> None:
-        """Show the maps where they are asked for and not there yet."""
+        """Show the maps that are requested and not computed yet."""
         if not self.fold.value or list(self.maps):
             return
         with refusals():
-            if (chosen := await self._measurement()) is None:
+            if (selection := await self._measurement()) is None:
                 return
-            html = await self.work.beside(maps_html, chosen[1])
-            if chosen[0] != self.name:
+            html = await self.work.beside(maps_html, selection[1])
+            if selection[0] != self.name:
                 return
             self.maps.clear()
             with self.maps:
@@ -194,11 +194,11 @@ class MeasurementCard:
     async def _masks(self) -> None:
         self.place.clear()
         with refusals():
-            if (chosen := await self._measurement()) is None:
+            if (selection := await self._measurement()) is None:
                 return
             self.place.clear()
             with self.place:
-                MaskCard(self.work, PAGE.name, *chosen, self.choice.choose)
+                MaskCard(self.work, PAGE.name, *selection, self.choice.choose)
 
 
 async def build(work: Workspace) -> None:

@@ -33,10 +33,10 @@ class ImagesPage:
 
     def __init__(self, work: Workspace, experiments: Sequence[str]) -> None:
         self.work, self.experiments, self.files = work, experiments, work.files
-        kept = work.draft(PAGE.name)
-        known = str(kept.get("experiment", ""))
-        self.experiment = known if known in experiments else experiments[0]
-        self.chosen, self.kept, self.most = str(kept.get("view", "")), dict(kept.get("edits", {})), MOST
+        memory = work.draft(PAGE.name)
+        available = str(memory.get("experiment", ""))
+        self.experiment = available if available in experiments else experiments[0]
+        self.selection, self.memory, self.most = str(memory.get("view", "")), dict(memory.get("edits", {})), MOST
         self.views: dict[str, View] = {}
         self.turn, self.closer_turn = 0, 0  # of building, and of showing a view large
         self.first: dict[str, int] = {}
@@ -53,7 +53,7 @@ class ImagesPage:
             self.closer = ui.element("div")
 
         async def turned() -> None:
-            self.experiment, self.chosen = select.value, ""
+            self.experiment, self.selection = select.value, ""
             await self.build()
 
         select.on_value_change(turned)
@@ -63,12 +63,12 @@ class ImagesPage:
         self.turn += 1
         turn = self.turn
         with refusals():
-            found = await self.work.beside(self.work.project.views, self.experiment)
-            self.views = {view.name: view for view in found}
+            outcome = await self.work.beside(self.work.project.views, self.experiment)
+            self.views = {view.name: view for view in outcome}
         written = {name: view.crop or Crop() for name, view in self.views.items()}
-        self.edits = CropEdits(written, self.kept.get(self.experiment))
-        if self.chosen not in self.views:
-            self.chosen = next(iter(self.views), "")
+        self.edits = CropEdits(written, self.memory.get(self.experiment))
+        if self.selection not in self.views:
+            self.selection = next(iter(self.views), "")
         self.keep()
         out = self.work.project.free_name("measurement.nc")
         self.command.show(["displacement", self.experiment, "--calibration", "calibration.toml", "-o", out])
@@ -86,16 +86,16 @@ class ImagesPage:
 
     def keep(self) -> None:
         """Keep what is chosen and edited over a reload."""
-        self.kept[self.experiment] = self.edits.kept
-        self.work.keep(PAGE.name, {"experiment": self.experiment, "view": self.chosen, "edits": self.kept})
+        self.memory[self.experiment] = self.edits.draft
+        self.work.keep(PAGE.name, {"experiment": self.experiment, "view": self.selection, "edits": self.memory})
 
     def _sum_up(self, wrong: Sequence[str]) -> None:
         lines = "".join(f"<li>{escape(text)}</li>" for text in wrong)
         listed = f"<ul class=notes aria-label='What is wrong'>{lines}</ul>" if lines else ""
-        said = f"<p class=told>{len(self.views)} views. {'' if wrong else 'Nothing is wrong with what was read.'}</p>"
+        messages = f"<p class=status>{len(self.views)} views. {'' if wrong else 'No problems found.'}</p>"
         self.summary.clear()
         with self.summary:
-            ui.html(said + listed, sanitize=False)
+            ui.html(messages + listed, sanitize=False)
 
     # -- a view in the grid --------------------------------------------------------------------------------------
 
@@ -130,7 +130,7 @@ class ImagesPage:
                 ui.html(f"<ul class=notes>{lines}</ul>", sanitize=False)
 
             async def choose() -> None:
-                self.chosen = view.name
+                self.selection = view.name
                 self.keep()
                 await self._closer()
                 ui.run_javascript("document.querySelector('.closer')?.scrollIntoView({block: 'start'})")
@@ -139,21 +139,21 @@ class ImagesPage:
             button.props("outline no-caps dense").props["aria-label"] = f"Look closer at {view.name}, crop or turn it"
         return wrong
 
-    # -- a view by itself ----------------------------------------------------------------------------------------
+    # -- a single view ----------------------------------------------------------------------------------------
 
     async def _closer(self) -> None:
         """Show the chosen view large, with what it is cropped to."""
         self.closer_turn += 1
-        turn, view = self.closer_turn, self.views.get(self.chosen)
+        turn, view = self.closer_turn, self.views.get(self.selection)
         self.closer.clear()
         self.editor = None
         if view is None:
             return
-        said: list[str] = []
+        messages: list[str] = []
         first: dict[str, int] = {}
         frame, address = (0, 0), ""
         for source in SOURCES:
-            with refusals(said.append):
+            with refusals(messages.append):
                 look = await self.work.beside(self.files.look, view, source, self.most)
                 first[source] = look.first
                 if not address:
@@ -165,7 +165,7 @@ class ImagesPage:
         with self.closer, card(view.name, "Drag over the whole frame to crop it, or type; the result is on the right."):
             self.closer.classes("closer")
             if not address:
-                text_html("There is no image to show: " + " ".join(said), classes="note")
+                text_html("There is no image to show: " + " ".join(messages), classes="note")
                 return
             with ui.element("div").classes("halves wide"):
                 with ui.element("div"):
@@ -189,7 +189,7 @@ class ImagesPage:
         self.state = ui.html("", sanitize=False)
 
     async def _edited(self, crop: Crop) -> None:
-        self.edits.put(self.chosen, crop)
+        self.edits.put(self.selection, crop)
         await self._show_result()
 
     async def _whole(self) -> None:
@@ -199,13 +199,13 @@ class ImagesPage:
 
     async def _for_all(self) -> None:
         for name in self.views:
-            self.edits.put(name, self.edits.now[self.chosen])
+            self.edits.put(name, self.edits.now[self.selection])
         await self._show_result()
 
     async def _step(self, step: Any) -> None:
         name = step()
-        if name and name != self.chosen:
-            self.chosen = name
+        if name and name != self.selection:
+            self.selection = name
             await self._closer()
             return
         if name and self.editor:
@@ -215,7 +215,7 @@ class ImagesPage:
     async def _show_result(self) -> None:
         """Show what the crop leaves of the images, and what is not yet in the folder."""
         self.keep()
-        view, crop = self.views[self.chosen], self.edits.now[self.chosen]
+        view, crop = self.views[self.selection], self.edits.now[self.selection]
         changed = self.edits.changed
         self.undo.set_enabled(bool(self.edits.past))
         self.redo.set_enabled(bool(self.edits.future))
@@ -224,19 +224,19 @@ class ImagesPage:
         text = f"{where} is not written yet for {', '.join(changed)}: nerif displacement does not know it before."
         done = "The commands see the views as they are shown here."
         self.state.set_content(f"<p class=note role=status>{escape(text if changed else done)}</p>")
-        shown: dict[str, str] = {}
+        display: dict[str, str] = {}
         for source, first in self.first.items():
             with refusals():
-                shown[source] = await self.work.beside(self.files.image, view, source, first, LARGE, crop)
-        if shown and (view, crop) == (self.views.get(self.chosen), self.edits.now.get(self.chosen)):
-            one = next(iter(shown.values()))
-            self.blink.show(shown.get("reference", one), shown.get("flow", one))
+                display[source] = await self.work.beside(self.files.image, view, source, first, LARGE, crop)
+        if display and (view, crop) == (self.views.get(self.selection), self.edits.now.get(self.selection)):
+            one = next(iter(display.values()))
+            self.blink.show(display.get("reference", one), display.get("flow", one))
 
     async def _save(self) -> None:
         with refusals():
             folder = self.work.project.path(self.experiment)
             await self.work.beside(write_crops, folder, self.edits.changed)
-            self.kept[self.experiment] = {**self.edits.kept, "now": {}}
+            self.memory[self.experiment] = {**self.edits.draft, "now": {}}
             ui.notify(f"{self.experiment}/views.toml is written.", type="positive")
             await self.build()
 
@@ -250,11 +250,11 @@ def _figure(view: View, source: str, look: ImageQuality | None, address: str) ->
     with ui.element("figure"):
         image = ui.element("img").props("loading=lazy")
         image.props["src"], image.props["alt"] = address, f"{source.capitalize()} of {view.name}"
-        seen = f"{look.count}" if look.sampled == look.count else f"{look.count} ({look.sampled} read)"
+        visible = f"{look.count}" if look.sampled == look.count else f"{look.count} ({look.sampled} read)"
         full = f"{look.saturated:.2%} saturated" if look.full > 1 else "saturation unknown"
         label = f"Grey values of {source} of {view.name}, {full}"
         ui.html(
-            f"<figcaption><b>{source.capitalize()}</b>, {seen}<br>{width} × {height} px, "
+            f"<figcaption><b>{source.capitalize()}</b>, {visible}<br>{width} × {height} px, "
             f"<span class=share>{full}</span></figcaption>"
             + histogram(look.histogram.tolist(), look.full, escape(label)), sanitize=False,
         )  # fmt: skip
@@ -262,12 +262,12 @@ def _figure(view: View, source: str, look: ImageQuality | None, address: str) ->
 
 async def build(work: Workspace) -> None:
     """Build the page."""
-    found = await work.beside(work.project.contents)
-    if not found.experiments:
+    outcome = await work.beside(work.project.contents)
+    if not outcome.experiments:
         with card("In this folder"):
             text_html("There are no images in this folder yet. " + LAYOUT, classes="note")
         return
-    page = ImagesPage(work, found.experiments)
+    page = ImagesPage(work, outcome.experiments)
     with ui.element("div"):
         ui.timer(0.01, page.build, once=True)  # the page is there before its images are read
 

@@ -57,18 +57,18 @@ class ReconstructPage:
 
     def __init__(self, work: Workspace, measurements: Iterable[str]) -> None:
         self.work = work
-        kept = work.draft(PAGE.name)
+        memory = work.draft(PAGE.name)
         self.measurements = tuple(measurements)
-        known = kept.get("measurement")
-        self.values: dict[str, dict[str, Any]] = {name: dict(kept.get(name, {})) for name in VALUES.values()}
+        available = memory.get("measurement")
+        self.values: dict[str, dict[str, Any]] = {name: dict(memory.get(name, {})) for name in VALUES.values()}
         with ui.element("div").classes("columns"):
             with card("A run"), ui.element("div").classes("form"):
                 text = "No measurement in this folder yet: nerif displacement or nerif simulate makes one."
                 note = text_html(text, classes="note")
-                self.measurement = FileChoice("Measurement", self.measurements, known, self._there, self._chosen)
+                self.measurement = FileChoice("Measurement", self.measurements, available, self._there, self._chosen)
                 note.bind_visibility_from(self.measurement.select, "options", lambda names: not names)
-                self.method = self._select("Method", LABELS, kept.get("method", "nerif"))
-                self.preset = self._select("Preset", ["auto", *PRESETS], kept.get("preset", "auto"))
+                self.method = self._select("Method", LABELS, memory.get("method", "nerif"))
+                self.preset = self._select("Preset", ["auto", *PRESETS], memory.get("preset", "auto"))
                 self.out = ui.input("Result directory", value=self._free()).props("outlined dense debounce=250")
                 self.out.on_value_change(self._show)
                 self.place = ui.element("div").classes("form")
@@ -99,9 +99,9 @@ class ReconstructPage:
 
     def _free(self) -> str:
         stem = PurePosixPath(self.measurement.name or "run").stem
-        taken = [job.out for job in self.work.jobs.all()]
+        occupied = [job.out for job in self.work.jobs.all()]
         ending = FILM if self.film else f"-{self.method.value}"
-        return self.work.project.free_name(f"results/{stem}{ending}", taken)
+        return self.work.project.free_name(f"results/{stem}{ending}", occupied)
 
     def _build_form(self) -> None:
         form: Form[Any] = form_of(self.method.value, self.preset.value)
@@ -123,8 +123,8 @@ class ReconstructPage:
         verb = "sequence" if self.film else "reconstruct"
         words = [verb, self.measurement.name or "MEASUREMENT.nc", "--out", self.out.value or "OUT"]
         if self.film:
-            chosen = ["--preset", self.preset.value] if self.preset.value != "auto" else []
-            return [*words, *chosen, *self.view.arguments]
+            selection = ["--preset", self.preset.value] if self.preset.value != "auto" else []
+            return [*words, *selection, *self.view.arguments]
         if self.method.value != "nerif":
             words += ["--method", self.method.value]
         elif self.preset.value != "auto":
@@ -133,14 +133,14 @@ class ReconstructPage:
 
     def _show(self) -> None:
         self.values[VALUES[self.film]] = dict(self.view.values)
-        kept = {"measurement": self.measurement.name, "method": self.method.value, "preset": self.preset.value}
-        self.work.keep(PAGE.name, {**kept, **self.values})
+        memory = {"measurement": self.measurement.name, "method": self.method.value, "preset": self.preset.value}
+        self.work.keep(PAGE.name, {**memory, **self.values})
         self.command.show(self.arguments())
-        self.start.set_enabled(bool(self.measurement.name and self.out.value) and self.view.right)
+        self.start.set_enabled(bool(self.measurement.name and self.out.value) and self.view.valid)
 
     def _start(self) -> None:
         with refusals():
-            self.view.made()
+            self.view.record()
             self.work.project.path(self.measurement.name)
             out = self.work.project.relative(self.out.value)
             job = self.work.jobs.add(self.arguments(), f"{self.measurement.name} → {out}", out)
@@ -156,9 +156,9 @@ async def build(work: Workspace) -> None:
 
 async def _measurements(work: Workspace) -> tuple[str, ...]:
     """What can be reconstructed: measurements, and films of them."""
-    found = await work.beside(work.project.contents)
-    films = [name for name in found.films if await work.beside(_measured, work, name)]
-    return (*found.measurements, *films)
+    result = await work.beside(work.project.contents)
+    films = [name for name in result.films if await work.beside(_measured, work, name)]
+    return (*result.measurements, *films)
 
 
 def _measured(work: Workspace, name: str) -> bool:

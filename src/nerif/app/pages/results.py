@@ -1,4 +1,4 @@
-"""Results: what came out, whether to trust it, and what others can do with it."""
+"""Results: fields, verdicts, comparison, export."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from nicegui import ui
 
 from nerif.app.forms import Form
 from nerif.app.job_form import JobForm
-from nerif.app.job_told import JobTold
+from nerif.app.job_status import JobStatus
 from nerif.app.jobs import Job
 from nerif.app.pages.page import Page
 from nerif.app.pieces import CommandLine, card, figures, refusals, text_html
@@ -83,14 +83,14 @@ class ResultsPage:
                 ui.html(figures([(a, b, "") for a, b in row.figures]), sanitize=False)
 
     async def _views(self) -> None:
-        kept = str(self.draft.get("tab", "slices"))
+        memory = str(self.draft.get("tab", "slices"))
         with ui.element("section").classes("card").props('aria-label="The result"'):
             with ui.tabs().props("no-caps align=left dense") as tabs:
                 for name, title in TABS.items():
                     ui.tab(name, title)
             others = [r.name for r in self.rows if r.name != self.row.name and r.film == self.row.film]
             look = ResultLook(self.work, self.row.name, others, self.draft, self.keep)
-            first = kept if kept in TABS else "slices"
+            first = memory if memory in TABS else "slices"
             with ui.tab_panels(tabs, value=first, animated=False).classes("panels-of-tabs") as panels:
                 with ui.tab_panel("slices"):
                     await look.build()
@@ -139,9 +139,9 @@ class ResultsPage:
             if job.state == "done":
                 await self.build()
 
-        button = "Write it anew" if file.is_file() else "Write the report"
+        button = "Write it again" if file.is_file() else "Write the report"
         ui.button(button, icon="playlist_add", on_click=write).props("outline no-caps")
-        writing = JobTold(self.work, f"{PAGE.name}.report {name}", written)
+        writing = JobStatus(self.work, f"{PAGE.name}.report {name}", written)
 
     # -- for others ----------------------------------------------------------------------------------------------
 
@@ -204,10 +204,10 @@ class ResultsPage:
 
 async def build(work: Workspace) -> None:
     """Build the page."""
-    found = await work.beside(work.project.contents)
-    page = ResultsPage(work, await work.beside(rows_of, work.project, found))
+    outcome = await work.beside(work.project.contents)
+    page = ResultsPage(work, await work.beside(rows_of, work.project, outcome))
     await page.build()
 
 
-ABOUT = "What came out, whether to trust it, and what to take along."
+ABOUT = "Fields, verdicts, comparison, export."
 PAGE = Page("results", "Results", "/results", ABOUT, build)

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from nerif.analysis.evaluation import FLOW, evaluate, rms_text
+from nerif.analysis.evaluation import FLOW, evaluate, rms_with_unit
 from nerif.cli.commands.output import counting_bar, say
 from nerif.cli.commands.settings import Settings, command
 from nerif.common.conventions import InputError
@@ -79,7 +79,7 @@ def _print_views(views: list[dict[str, Any]]) -> None:
     for v in views:
         name = f"{v['name']}, {v['measured']}" if several else v["name"]
         flag = "  withheld" if v["withheld"] else ""
-        say(f"{name:<{14 + 14 * several}} {v['cc']:7.4f} {v['ssim']:7.4f} {v['psnr']:10.2f} {rms_text(v)}{flag}")
+        say(f"{name:<{14 + 14 * several}} {v['cc']:7.4f} {v['ssim']:7.4f} {v['psnr']:10.2f} {rms_with_unit(v)}{flag}")
 
 
 def _run_over_time(settings: Evaluate) -> dict[str, Any]:

@@ -11,7 +11,7 @@ import torch
 import tyro
 from torch import Tensor
 
-from nerif.analysis.evaluation import rms_text
+from nerif.analysis.evaluation import rms_with_unit
 from nerif.cli.commands.output import say
 from nerif.cli.commands.settings import Settings, command
 from nerif.common.conventions import InputError, with_unit
@@ -132,7 +132,7 @@ def _result(path: Path) -> None:
             say(f"  {name:<18} {value}")
     for v in metrics.get("views", []):
         use = "withheld" if v["withheld"] else "training"
-        say(f"  view {v['name']:<14} {use}  CC {number(v['cc'], 5)}  rms {v['measured']} error {rms_text(v)}")
+        say(f"  view {v['name']:<14} {use}  CC {number(v['cc'], 5)}  rms {v['measured']} error {rms_with_unit(v)}")
 
 
 main = command("info", Info, run)

@@ -12,7 +12,7 @@ from nerif.cli.commands.output import check_output, counting_bar, say
 from nerif.cli.commands.settings import Flat, Settings, command
 from nerif.common.settings import Count
 from nerif.data.volume_sequence import VolumeSequence
-from nerif.report.movie import Movie, frames_there
+from nerif.report.movie import Movie, finished_frames
 
 __all__ = ["MovieCommand", "main", "run"]
 
@@ -36,7 +36,7 @@ def run(settings: MovieCommand) -> None:
     """Write the movie."""
     check_output(settings.out, settings.force)
     store = VolumeSequence(settings.result)
-    complete = frames_there(store)
+    complete = finished_frames(store)
     frames = complete[:: settings.every]
     with counting_bar("drawing frames", len(frames)) as bar:
         settings.look.write(settings.out, store, frames, bar)

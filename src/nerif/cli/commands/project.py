@@ -15,7 +15,7 @@ from nerif.common.conventions import InputError, with_unit
 from nerif.data.measurement import Measurement
 from nerif.forward.registry import AUTO, model_of, technique, technique_of
 from nerif.geometry import Ring
-from nerif.reconstruction.aperture import seen_through
+from nerif.reconstruction.aperture import apply_aperture
 from nerif.reconstruction.shared_settings import Aperture
 from nerif.results.directory import ResultDirectory
 
@@ -60,7 +60,7 @@ def run(settings: Project) -> Measurement:
     if settings.cameras is not None:
         if settings.f_number:
             raise InputError("expected 0 with --cameras FILE, which has the apertures", field="f_number")
-        source = seen_through(Measurement.read(settings.cameras), settings.aperture)
+        source = apply_aperture(Measurement.read(settings.cameras), settings.aperture)
         wavelength = wavelength or source.wavelength_nm
         cameras = (source.select(settings.names) if settings.names else source).cameras
     else:

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from nerif.common.conventions import InputError
+from nerif.common.conventions import LARGEST_LENGTH, InputError, check_positive
 from nerif.geometry import Box, Lens, Plane
 from nerif.imaging.calibration.cameras_file import CalibratedCamera, check_camera
 from nerif.imaging.calibration.importers.importers import ImportSettings
@@ -59,26 +59,20 @@ class SimpleRig:
     """With --simple: column and row of the optical axis, if it is not in the middle of the image (of a crop)."""
 
     def __post_init__(self) -> None:
-        for name in ("distance", "mm_per_px", "focal_length", "pixel_pitch_um", "f_number"):
-            value = getattr(self, name)
-            if value is not None and not 0 < value < math.inf:
-                raise InputError(f"expected a positive number, got {value}", field=name)
+        lengths = ("distance", "mm_per_px", "focal_length", "pixel_pitch_um", "f_number")
+        check_positive(self, *(name for name in lengths if getattr(self, name) is not None), limit=LARGEST_LENGTH)
         for name in ("axis_from", "axis_to", "principal_point"):
             value = getattr(self, name)
             if value is not None and not math.isfinite(math.fsum(value)):
                 raise InputError(f"expected column and row of a pixel, got {value}", field=name)
-        if (self.axis_from is None) != (self.axis_to is None):
-            raise InputError("expected two points of the axis or neither", field="axis_from, axis_to")
-        if self.axis_from and self.axis_to and not math.dist(self.axis_from, self.axis_to) >= 1:
+        first, last = self.axis_from, self.axis_to
+        if (first is None) != (last is None) or (first and last and not math.dist(first, last) >= 1):
+            got = f"{first} and {last}"
             raise InputError(
-                f"expected two pixels at least 1 px apart, got {self.axis_from} and {self.axis_to}",
-                field="axis_from, axis_to",
+                f"expected two pixels at least 1 px apart or neither, got {got}", field="axis_from, axis_to"
             )
         if self.mm_per_px is not None and self.pixel_pitch_um is not None:
-            raise InputError(
-                "expected one of the two, since either gives the scale; leave out the pitch",
-                field="mm_per_px, pixel_pitch_um",
-            )
+            raise InputError("expected one of the two scales, got both", field="mm_per_px, pixel_pitch_um")
         if self.f_number is not None and self.focal_length is None:
             raise InputError(
                 "expected together with focal_length, got it alone; or give --aperture-diameter, their quotient in mm",

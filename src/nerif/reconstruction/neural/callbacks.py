@@ -283,7 +283,7 @@ class DivergenceGuard(Callback):
         trainer.load_state_dict(states.first if empty else states.good)
         schedule.load_state_dict({**schedule.state_dict(), "seconds": seconds, "rate_factor": rate_factor})
         self.rollbacks, trainer.readings.values, schedule.outcome = rollbacks, None, None
-        trainer.history.log(trainer, {"taken_back": float(rollbacks)})
+        trainer.history.log(trainer, {"rolled_back": float(rollbacks)})
         if empty and (rollbacks > MAX_ROLLBACKS or schedule.limit()):
             schedule.outcome = Outcome(
                 "collapsed",

@@ -67,7 +67,7 @@ class Objective:
         return self._ambient_term([p.part for p in batch.pieces], [p.numbers for p in batch.pieces])
 
     def _ambient_term(self, parts: list[Part], numbers: list[int]) -> Tensor:
-        terms = (reduce(part.of_nothing, self.settings.norm) for part in parts)
+        terms = (reduce(part.ambient_residual, self.settings.norm) for part in parts)
         total = sum(share * term for share, term in zip(shares(numbers), terms, strict=True))
         assert isinstance(total, Tensor)
         return total

@@ -18,7 +18,7 @@ from nerif.common.conventions import InputError
 from nerif.fields.base import Field
 from nerif.fields.network import UNBOUNDED
 from nerif.reconstruction.base import OnStep, Outcome, Reconstruction, State
-from nerif.reconstruction.bounds import check_resumed
+from nerif.reconstruction.bounds import check_same_bounds
 from nerif.reconstruction.device import Cores, float32_products, peak_memory
 from nerif.reconstruction.files import check_fingerprint
 from nerif.reconstruction.neural.callbacks import (
@@ -94,7 +94,7 @@ class Trainer:
         if resume is not None:
             check_fingerprint(resume.scalars.get("fingerprint"), data.fingerprint)
             self.load_state_dict(resume)
-            check_resumed(self.field.bounds, data.bounds)
+            check_same_bounds(self.field.bounds, data.bounds)
 
     def run(self, on_step: OnStep | None = None) -> Reconstruction:
         """Train until the schedule is done and return the result."""

@@ -22,7 +22,7 @@ from nerif.data.measurement import Measurement
 from nerif.fields.network import Network, NeuralField
 from nerif.fields.symmetric import SymmetricNetwork
 from nerif.forward.base import ForwardModel
-from nerif.reconstruction.aperture import lens_rays, seen_through
+from nerif.reconstruction.aperture import apply_aperture, lens_rays
 from nerif.reconstruction.bounds import field_bounds, in_units
 from nerif.reconstruction.device import resolve_device
 from nerif.reconstruction.files import fingerprint
@@ -31,7 +31,7 @@ from nerif.reconstruction.neural.bins import coarsest_edge, withhold_pixels
 from nerif.reconstruction.neural.settings import TrainingSettings
 from nerif.reconstruction.rig.parameters import refined_groups
 from nerif.reconstruction.rig.refinement import Refinement, load_rig, random_pixels, rig_state
-from nerif.reconstruction.sources import chosen_source, of_source, stages
+from nerif.reconstruction.sources import of_source, resolve_source, stages
 from nerif.reconstruction.symmetry import axis_of
 from nerif.reconstruction.target import Part, Target, check_target
 
@@ -105,10 +105,10 @@ class TrainingData:
     def __init__(
         self, settings: TrainingSettings, measurement: Measurement, coarsest: int | None = None, withhold: bool = False
     ) -> None:
-        measurement = seen_through(measurement, settings.aperture)
+        measurement = apply_aperture(measurement, settings.aperture)
         # images do not determine a shift
         preferred = "displacements" if "shift" in refined_groups(settings.refine) else "images"
-        source = chosen_source(measurement, settings.source, preferred)
+        source = resolve_source(measurement, settings.source, preferred)
         final = of_source(measurement, source)
         check_target(final, settings.model)
         self.device, self.fingerprint = resolve_device(settings.device), fingerprint(final, settings.open_faces)

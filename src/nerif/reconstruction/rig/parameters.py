@@ -16,7 +16,7 @@ from nerif.data.measurement import Measurement
 from nerif.geometry import Camera
 from nerif.geometry.pose import GEOMETRY, Corrections
 
-__all__ = ["GROUPS", "MOVED", "NAMES", "check_refined", "displaced", "moved_lines", "prior", "with_corrections"]
+__all__ = ["GROUPS", "MOVED", "NAMES", "check_refined", "displaced", "prior", "refinement_lines", "with_corrections"]
 
 IMAGE = ("u", "v", "u_x", "u_y", "v_x", "v_y")
 """Displacement of a whole image, px: constant, and growing from the middle to the edge along columns and rows."""
@@ -120,7 +120,7 @@ def _check_table(table: Any) -> None:
             )
 
 
-def moved_lines(table: Sequence[dict[str, Any]]) -> list[str]:
+def refinement_lines(table: Sequence[dict[str, Any]]) -> list[str]:
     """Return a summary of a refinement, and a line for each view with a significant correction."""
     most = max(table, key=lambda row: row["moved"])
     lines = [f"refined {len(table)} views; largest correction: {most['name']}, {most['moved']:.1f} sigma"]

@@ -141,7 +141,7 @@ class Refinement:
         if cameras is not None and list(cameras) != list(range(len(self.cameras))):
             rays = replace(rays, view=torch.tensor(cameras, device=rays.view.device).to(rays.view)[rays.view.long()])
         geometric = any(i < len(GEOMETRY) for i in self.columns)
-        corrected = self._corrections.moved(rays, self.box) if geometric else rays
+        corrected = self._corrections.apply(rays, self.box) if geometric else rays
         return replace(part, rays=replace(corrected, view=part.rays.view), offset=self._offset(self.values, rays))
 
     def table(self) -> list[dict[str, Any]]:
@@ -261,7 +261,7 @@ class Refinement:
     ) -> tuple[Tensor, Tensor]:
         """Return the residual of a part of calibrated rays, without reducing outliers, and the path integral."""
         if integral is None:
-            integral = predict(part, self._of(values).moved(part.rays, self.box))
+            integral = predict(part, self._of(values).apply(part.rays, self.box))
         offset = self._offset(values, part.rays)
         prediction = integral if offset is None else integral + offset
         return part.model.residual(prediction, part.measured, part.rays) * part.inverse_scale, integral

@@ -24,7 +24,7 @@ from nerif.common.conventions import InputError
 from nerif.common.pauses import pause
 from nerif.data.measurement import Measurement
 from nerif.fields.base import Field
-from nerif.reconstruction.aperture import seen_through
+from nerif.reconstruction.aperture import apply_aperture
 from nerif.reconstruction.base import OnStep, Outcome, Reconstruction, State, Step
 from nerif.reconstruction.bounds import field_bounds
 from nerif.reconstruction.device import Cores, available_memory, peak_memory, resolve_device
@@ -72,7 +72,7 @@ class Descent:
         start: Field | None,
     ) -> None:  # fmt: skip
         measurement = of_source(measurement, settings.source, preferred="displacements")
-        measurement = seen_through(measurement, settings.aperture)
+        measurement = apply_aperture(measurement, settings.aperture)
         self.settings, self.measurement, self.on_step, self.start = settings, measurement, on_step, start
         self.device = resolve_device(settings.device)
         self.cores = Cores(self.device)

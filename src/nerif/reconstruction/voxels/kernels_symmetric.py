@@ -23,12 +23,9 @@ RAY_GROUPS = 16  # each with coefficients of its own, so that the sum does not d
 def integrate(degree: int, padded: Tensor, path: Sequence[Tensor], plane: Tensor, gradient: bool) -> Tensor:
     """Return per ray the integrals of the gradient along e1, e2, e3, (n, 3), or of the field, (n, 1).
 
-    Parameters
-    ----------
-    padded : (z, k, x) coefficients, extended beyond the box along z and x
-    path : start, stride (n, 3), profile (n, 2) or (n, m, 1), count (n)
-    plane : (8) lower r and h, voxel edges along r and h, voxels along r and h, rounding of the axis (below 0: no axis),
-        layers before the first coefficient
+    `padded` (z, k, x) is extended along z and x. `path` is start, stride (n, 3), profile (n, 2) or (n, m, 1), count
+    (n,). `plane` (8) is lower r and h, voxel edges along r and h, voxels along r and h, rounding of the axis (below 0:
+    no axis), layers before the first coefficient.
     """
     part = GRADIENT if gradient else VALUE
     sums = np.zeros((len(path[0]), len(part)))

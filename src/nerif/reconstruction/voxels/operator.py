@@ -36,10 +36,8 @@ class VoxelOperator:
 
     Parameters
     ----------
-    rays : clipped to the box of the grid; at least one crosses it
-    model : a linear one
+    rays : clipped to the box of the grid
     basis : "linear" (coefficients are the values at voxel centres) or "cubic"
-    boundary : how the coefficients are extended beyond the box
     step : largest distance of planes in voxel edges, up to MAX_STEP; None for that
     device, dtype : of c and y
 
@@ -107,9 +105,8 @@ class VoxelOperator:
         rays = self.range_shape[0] if self.shares is None else self.shares.numel()
         result = torch.zeros(rays, self.range_shape[1], dtype=self.dtype, device=self.device)
         self._integrate(padded.to(self.device, self.dtype), result)
-        if self.shares is None:
-            return result
-        return (result.reshape(*self.shares.shape[:2], -1) * self.shares).sum(dim=1)
+        shares = self.shares
+        return result if shares is None else (result.reshape(*shares.shape[:2], -1) * shares).sum(dim=1)
 
     def T(self, projections: Float[Tensor, "n c"]) -> Float[Tensor, "z y x"]:
         """Apply the adjoint."""

@@ -162,13 +162,8 @@ class Bundle:
 def profiles(model: ForwardModel, rays: Rays, s: Tensor, apart: Tensor, steps: Tensor) -> tuple[Weights, Tensor]:
     """Return the weights of the end samples, and the profile of each ray.
 
-    The profile is (n, 2), first value and increment, where it is linear along every ray, else (n, m, 1).
-
-    Parameters
-    ----------
-    s : (n,) path length of the first sample, mm
-    apart : (n,) path length between samples, mm; negative where samples run against the ray
-    steps : (n,) from the first sample to the last
+    The profile is (n, 2), first value and increment, where it is linear along every ray, else (n, m, 1). The first
+    sample is at path length s, the others `apart` (mm; negative where samples run against the ray), `steps` in all.
     """
     ends = torch.stack([s, s + steps * apart], dim=1)
     weights = model.weights(rays, ends, apart.abs()[:, None].expand_as(ends))

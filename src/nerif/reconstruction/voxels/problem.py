@@ -82,14 +82,9 @@ class Differences:
 
 
 class Problem:
-    """The data and the operators on one grid.
+    """The data and the operators on one grid, one for each part of the target.
 
-    Parameters
-    ----------
-    operators : one for each part of the target
-    target : on the operators' device
-    free : (z, y, x) voxels that are not ambient, or None for all
-    bounds : lowest and highest value of the field, or None
+    `free` voxels are not ambient, None for all; `bounds` are the lowest and highest value of the field, or None.
     """
 
     def __init__(

@@ -114,12 +114,9 @@ class VoxelReconstructor(SharedSettings):
         return self.operator_bytes(measurement, grid) + volumes + data + preparing + overhead
 
     def __call__(
-        self,
-        measurement: Measurement,
-        on_step: OnStep | None = None,
-        resume: State | None = None,
+        self, measurement: Measurement, on_step: OnStep | None = None, resume: State | None = None,
         start: Field | None = None,
-    ) -> Reconstruction:
+    ) -> Reconstruction:  # fmt: skip
         return Descent(self, measurement, on_step, resume, start)()
 
 

@@ -27,7 +27,7 @@ from nerif.forward.path_integral import PathIntegral, project
 from nerif.forward.registry import forward_model
 from nerif.geometry import Grid
 from nerif.physics.quantities import derive
-from nerif.reconstruction.aperture import seen_through
+from nerif.reconstruction.aperture import apply_aperture
 from nerif.reconstruction.base import OnStep, Step
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.workflow.sequence.plan import Event, SequencePlan
@@ -112,7 +112,7 @@ def finished_frame(plan: SequencePlan, field: NeuralField, measurement: Measurem
     grid = Grid.of_resolution(measurement.box, plan.settings.voxels)
     volume = Volume.of(field.sample(grid, device), grid, measurement.quantity, measurement.n_ambient)
     volumes = [derive(volume, quantity, plan.settings.gas) for quantity in plan.settings.quantities]
-    scores = _scores(plan.cold.model, field, seen_through(measurement, plan.cold.aperture), device)
+    scores = _scores(plan.cold.model, field, apply_aperture(measurement, plan.cold.aperture), device)
     return Frame(field, volumes, scores, seconds=0.0, steps=0)
 
 

@@ -13,10 +13,10 @@ from nerif.common.interruption import Interrupted
 from nerif.data.measurement import Measurement
 from nerif.data.measurement_sequence import MeasurementSequence
 from nerif.geometry import Grid
-from nerif.reconstruction.aperture import seen_through
+from nerif.reconstruction.aperture import apply_aperture
 from nerif.reconstruction.bounds import field_bounds
 from nerif.reconstruction.neural.neural import NeRIF
-from nerif.reconstruction.symmetry import axis_of, symmetry_asked, with_axis
+from nerif.reconstruction.symmetry import axis_of, symmetry_of, with_axis
 from nerif.workflow.sequence.cluster import check_workers, open_cluster
 from nerif.workflow.sequence.plan import SequencePlan, SequenceSettings
 from nerif.workflow.sequence.run import Progress, outcome_table, run_sequence
@@ -76,7 +76,7 @@ def reconstruct_sequence(
             field="refine",
         )
     sequence = MeasurementSequence.read(measurement)
-    like = seen_through(sequence.fullest(), reconstructor.aperture)
+    like = apply_aperture(sequence.fullest(), reconstructor.aperture)
     like.without(settings.withhold)
     settings = settings.for_measurement(like)
     network = reconstructor.resolved_by(like).network
@@ -118,7 +118,7 @@ def _store(
     if axis is not None:
         for line in axis.sentences:
             say(line)
-        symmetry = symmetry_asked(with_axis(plan.cold, axis.symmetry), like)
+        symmetry = symmetry_of(with_axis(plan.cold, axis.symmetry), like)
         assert symmetry is not None
         attributes["symmetry"] = asdict(symmetry)
     grid = Grid.of_resolution(like.box, plan.settings.voxels)

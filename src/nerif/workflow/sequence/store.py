@@ -117,7 +117,7 @@ class SequenceStore(VolumeSequence):
     def symmetry(self) -> Symmetry | None:
         """Symmetry of the fields of all frames, mm, if any."""
         entries = self.attributes.get("symmetry")
-        return Symmetry.kept(entries) if entries else None
+        return Symmetry.from_entries(entries) if entries else None
 
     @property
     def status(self) -> np.ndarray:
@@ -199,6 +199,6 @@ def _network(attributes: dict[str, Any], box: Box, scale: float = 1.0) -> Networ
     low, high = attributes.get("bounds", (None, None))  # no infinity in JSON
     bounds = in_units((-math.inf if low is None else low, math.inf if high is None else high), scale)
     if attributes.get("symmetry"):
-        symmetry = Symmetry.kept(attributes["symmetry"]).in_units(box.centre, max(box.edges) / 2)
+        symmetry = Symmetry.from_entries(attributes["symmetry"]).in_units(box.centre, max(box.edges) / 2)
         return SymmetricNetwork(shape, symmetry, bounds)
     return Network(shape, bounds=bounds)

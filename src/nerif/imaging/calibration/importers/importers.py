@@ -7,13 +7,14 @@ centre of the first pixel, world to camera, mm.
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
 
-from nerif.common.conventions import InputError
+from nerif.common.conventions import InputError, check_positive
 from nerif.geometry import Box, Lens, Plane
 from nerif.geometry.camera import POWERS
 from nerif.imaging.calibration.cameras_file import CalibratedCamera, check_camera, check_names, read_box
@@ -58,14 +59,11 @@ class ImportSettings:
         if self.focus_distance is not None and self.aperture_diameter is None:
             raise InputError("expected together with aperture_diameter, got it alone", field="focus_distance")
         _ = self.lens  # validates its numbers
-        for name in ("pose_sigma_mm", "pose_sigma_deg"):
-            value = getattr(self, name)
-            if value is not None and not 0 <= value < math.inf:
-                raise InputError(f"expected a standard deviation of 0 or more, got {value}", field=name)
+        sigmas = [name for name in ("pose_sigma_mm", "pose_sigma_deg") if getattr(self, name) is not None]
+        check_positive(self, *sigmas, zero=True, limit=sys.float_info.max)
+        check_positive(self, "scale_mm")
         if (self.pose_sigma_mm is None) != (self.pose_sigma_deg is None):
             raise InputError("expected both or neither", field="pose_sigma_mm, pose_sigma_deg")
-        if not self.scale_mm > 0:
-            raise InputError(f"expected a positive number, got {self.scale_mm}", field="scale_mm")
 
     @property
     def pose_sigma(self) -> tuple[float, float] | None:

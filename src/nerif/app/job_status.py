@@ -1,4 +1,4 @@
-"""How one run goes, told where it was asked for: it waits, what it says, how it ended, what to go on with."""
+"""Status of one run on the page that started it: state, last lines of the log, and a button to continue."""
 
 from __future__ import annotations
 
@@ -11,56 +11,56 @@ from nerif.app.pieces import text_html
 from nerif.app.workspace import Workspace
 from nerif.common.conventions import InputError
 
-__all__ = ["LINES", "JobTold"]
+__all__ = ["LINES", "JobStatus"]
 
 EVERY = 0.7  # seconds
 LINES = 3  # of the log
-SAID = {"done": "It is done.", "failed": "It failed; what it said:", "stopped": "It was stopped.", "refused": REFUSED}
+ENDS = {"done": "It is done.", "failed": "It failed; end of the log:", "stopped": "It was stopped.", "refused": REFUSED}
 
 
-class JobTold:
-    """A few lines about one run, where the page is being built; a page that is loaded again goes on with it.
+class JobStatus:
+    """State and log of one run, added to the page under construction and restored after a reload.
 
     Parameters
     ----------
-    work : Workspace
-    name : under which the run is kept over a reload
-    ended : done when it has
-    offer : done by a button that goes on with the file that the run has written; None for no button
-    lines : of what it has said, that are shown when it has ended well
+    work : workspace of the project
+    name : key of the draft with the id of the run
+    on_end : called when the run has ended
+    offer : called by a button that continues with the output; None for no button
+    lines : number of log lines shown after success
     """
 
     def __init__(
-        self, work: Workspace, name: str, ended: Callable[[Job], Awaitable[None]] | None = None,
+        self, work: Workspace, name: str, on_end: Callable[[Job], Awaitable[None]] | None = None,
         offer: Callable[[str], Awaitable[None]] | None = None, lines: int = LINES,
     ) -> None:  # fmt: skip
         self.work, self.name, self.job = work, name, str(work.draft(name).get("job", ""))
-        self._ended, self._offer, self._lines = ended, offer, {"done": lines, "failed": 30}
-        self._shown: tuple[str, ...] = ()
+        self._on_end, self._offer, self._lines = on_end, offer, {"done": lines, "failed": 30}
+        self._content: tuple[str, ...] = ()
         self.place = ui.element("div").props("role=status aria-live=polite")
         self.further = ui.element("div")
         with ui.element("div"):
             ui.timer(EVERY, self._look)
 
     def follow(self, job: Job) -> None:
-        """Tell of that run from now on."""
+        """Show this run."""
         self.job = job.id
         self.work.keep(self.name, {"job": job.id})
         self.further.clear()
-        self._say("It waits in the queue.")
+        self._show("It waits in the queue.")
 
-    def _say(self, text: str, log: Sequence[str] = ()) -> None:
-        if self._shown == (text, *log):
+    def _show(self, text: str, log: Sequence[str] = ()) -> None:
+        if self._content == (text, *log):
             return
-        self._shown = (text, *log)
+        self._content = (text, *log)
         self.place.clear()
         with self.place:
-            text_html(text, classes="told")
+            text_html(text, classes="status")
             if log:
-                text_html("\n".join(log), "pre", "said")
+                text_html("\n".join(log), "pre", "output")
 
     def _forget(self) -> None:
-        """Follow nothing; a run that another tab has started meanwhile stays kept."""
+        """Show no run; the draft of a run started in another tab stays."""
         if self.work.draft(self.name).get("job") == self.job:
             self.work.keep(self.name, {})
         self.job = ""
@@ -71,22 +71,22 @@ class JobTold:
         try:
             job = await self.work.beside(self.work.jobs.get, id)
             log = await self.work.beside(self.work.jobs.log, id, self._lines.get(job.state, LINES))
-        except InputError:  # forgotten in another tab
+        except InputError:  # removed in another tab
             if id == self.job:
                 self._forget()
             return
-        if id != self.job:  # another one has been started meanwhile
+        if id != self.job:  # another run has started meanwhile
             return
-        lines = [line.rpartition("\r")[2] for line in log]  # of a progress bar, as it stands
-        if job.state not in SAID:
-            self._say("It waits in the queue." if job.state == "queued" else f"It is {job.state}.", lines[-1:])
+        lines = [line.rpartition("\r")[2] for line in log]  # the last state of a progress bar
+        if job.state not in ENDS:
+            self._show("It waits in the queue." if job.state == "queued" else f"It is {job.state}.", lines[-1:])
             return
-        self._say(SAID[job.state], lines)
+        self._show(ENDS[job.state], lines)
         self._forget()
         if self._offer is not None and job.state == "done" and job.file:
             self._go_on(self._offer, self.work.project.relative(job.file))
-        if self._ended is not None:
-            await self._ended(job)
+        if self._on_end is not None:
+            await self._on_end(job)
 
     def _go_on(self, offer: Callable[[str], Awaitable[None]], file: str) -> None:
         self.further.clear()
