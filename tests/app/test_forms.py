@@ -48,8 +48,8 @@ def test_help_is_that_of_the_class_that_has_the_field():
     [
         ({"f_number": -1.0}, "f_number", "Expected a positive number, got -1.0"),
         ({"views": "many"}, "views", "valid integer"),
-        ({"magnification": 0.5}, "magnification", "with projection = telecentric"),
-        ({"image_size": [0, 4]}, "image_size", "(height, width) > 0"),
+        ({"magnification": 0.5}, "magnification", "projection = telecentric"),
+        ({"image_size": [0, 4]}, "image_size", "1 or more"),
         ({"temperature": 293.15}, "temperature", "not ambient_temperature"),
     ],
 )

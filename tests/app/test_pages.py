@@ -65,7 +65,7 @@ def test_the_design_follows_what_is_typed_and_is_kept_over_a_reload(browser, ser
     assert browser.execute_script("return document.querySelector('.drawing').innerHTML") not in drawing
     put(browser, "focal_length", "-3")
     wait_for(browser, "return document.querySelector('.error span') !== null")
-    assert text(browser, ".error span") == "Expected a number above 0 and at most 1e+07, got -3.0"
+    assert "got -3.0" in text(browser, ".error span")
     assert browser.execute_script("return document.querySelector('input[name=focal_length]').ariaInvalid") == "true"
     put(browser, "focal_length", "60")
     wait_for(browser, "return document.querySelector('.error span') === null")
