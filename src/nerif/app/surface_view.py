@@ -57,7 +57,7 @@ class SurfaceView:
             self._draw()
 
         label = f"Level{f', {unit}' if unit else ''}"
-        self._slider = RangeSlider(label, STEPS, min(max(step, 1), STEPS - 1), self._text, move, settled=True)
+        self._slider = RangeSlider(label, STEPS, min(max(step, 1), STEPS - 1), self._text, move, on_release=True)
         self._named = ui.html("", sanitize=False)
         # named for those who do not see it: what it shows is in the slices too
         self.scene = BoxScene(box, "Isosurface; drag to turn, scroll to come nearer")
