@@ -52,7 +52,7 @@ class Still:
 
     @property
     def quantities(self) -> tuple[str, ...]:
-        """Quantities to display; n is left out beside its excess over ambient, a standard deviation follows its mean."""
+        """Quantities to display: n only without its excess over ambient, standard deviations after their means."""
         return _worth_showing(self._volumes)
 
     def volume(self, quantity: str, frame: int = 0) -> Volume:
