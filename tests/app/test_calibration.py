@@ -78,7 +78,7 @@ def test_corners_are_found_and_a_image_is_left_out_by_a_click(browser, server):
     said = browser.execute_script("return [...document.querySelectorAll('.target img')].map(e => e.alt)")
     assert said[0] == f"cam1/target/0, {points} points found"
     assert said[2] == "cam1/target/2, no target found"
-    browser.find_element("css selector", "button[aria-label='Leave it out: cam1/target/1']").click()
+    browser.find_element("css selector", "button[aria-label='Exclude: cam1/target/1']").click()
     wait_for(browser, "return document.querySelector('.command code').textContent.includes('--leave-out')")
     words = line(browser)
     assert words[:4] == ["nerif", "calibrate", "run", "-o"]
@@ -86,7 +86,7 @@ def test_corners_are_found_and_a_image_is_left_out_by_a_click(browser, server):
     visit(browser, server)  # a reload loses nothing
     wait_for(browser, "return document.querySelectorAll('.target.left-out').length === 1")
     assert line(browser) == words
-    browser.find_element("css selector", "button[aria-label='Take it again: cam1/target/1']").click()
+    browser.find_element("css selector", "button[aria-label='Include: cam1/target/1']").click()
     wait_for(browser, "return !document.querySelector('.command code').textContent.includes('--leave-out')")
     assert errors(browser) == []
 
@@ -129,8 +129,8 @@ def test_a_calibration_by_its_settings_file(browser, tmp_path):
     with served(tmp_path) as server:
         visit(browser, server)
         assert "--config" in line(browser)
-        wait_for(browser, "return document.querySelector('[aria-label=\"Leave it out: 10deg/target/3\"]') !== null")
-        browser.find_element("css selector", "button[aria-label='Leave it out: 10deg/target/3']").click()
+        wait_for(browser, "return document.querySelector('[aria-label=\"Exclude: 10deg/target/3\"]') !== null")
+        browser.find_element("css selector", "button[aria-label='Exclude: 10deg/target/3']").click()
         wait_for(browser, "return document.querySelector('.command code').textContent.includes('--leave-out')")
         browser.find_element("xpath", "//button[contains(., 'Calibrate')]").click()
         wait_for(browser, "return document.querySelector('.status')?.textContent === 'It is done.'", 60)

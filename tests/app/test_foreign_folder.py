@@ -128,7 +128,7 @@ def test_the_secret_is_the_users_alone(tmp_path, monkeypatch):
     assert path.stat().st_mode & 0o777 == 0o600
     assert [p.name for p in path.parent.iterdir()] == ["secret"]
     path.chmod(0o644)
-    with pytest.raises(InputError, match=r"expected 32 bytes that you alone can read .* delete it"):
+    with pytest.raises(InputError, match=r"expected 32 bytes that only you can read .* delete it"):
         Jobs(tmp_path)
 
 

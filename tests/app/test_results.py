@@ -223,9 +223,9 @@ def test_a_film_is_moved_through_time(browser, server):
     browser.find_element("css selector", "input[aria-label=Time]").send_keys(Keys.RIGHT * 2)
     wait_for(browser, "return document.querySelector('.time b').textContent === '2 ms (frame 3)'")
     wait_for(browser, f"return document.querySelector('.cuts img').src !== {before[0]!r}")
-    browser.find_element("xpath", "//button[@aria-label='Play or halt the film']").click()
+    browser.find_element("xpath", "//button[@aria-label='Play or pause the film']").click()
     wait_for(browser, "return document.querySelector('.time b').textContent === '0 ms (frame 1)'")
-    browser.find_element("xpath", "//button[@aria-label='Play or halt the film']").click()
+    browser.find_element("xpath", "//button[@aria-label='Play or pause the film']").click()
     assert errors(browser) == []
 
 

@@ -20,7 +20,7 @@ from app.serving import Served, answering, free_port, outside, served
 from nerif.app.command import App
 from nerif.app.guard import cookie_of
 from nerif.app.private import page_leading_to
-from nerif.app.server import Address, without_address
+from nerif.app.server import Address, is_relevant
 from nerif.cli.cli import main
 from nerif.cli.commands.settings import read_settings
 from nerif.common.conventions import InputError
@@ -217,5 +217,5 @@ def test_a_browser_that_goes_on_is_no_error_and_all_else_is(error, shown):
         raise RuntimeError(error)
     except RuntimeError:
         entry = logging.LogRecord("uvicorn.error", logging.ERROR, "", 0, "Exception", (), sys.exc_info())
-    assert without_address(entry) is shown
-    assert without_address(logging.LogRecord("uvicorn.error", logging.INFO, "", 0, "ready", (), None))
+    assert is_relevant(entry) is shown
+    assert is_relevant(logging.LogRecord("uvicorn.error", logging.INFO, "", 0, "ready", (), None))

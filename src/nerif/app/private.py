@@ -1,7 +1,4 @@
-"""Files that the user alone can read, outside of every project.
-
-They are in $XDG_STATE_HOME/nerif, by default ~/.local/state/nerif.
-"""
+"""Files that only the user can read, in $XDG_STATE_HOME/nerif (default ~/.local/state/nerif)."""
 
 from __future__ import annotations
 
@@ -21,15 +18,9 @@ LENGTH = 32  # of the secret, bytes
 
 
 def _directory() -> Path:
-    """The directory, made if it is missing.
-
-    Raises
-    ------
-    InputError
-        If it cannot be made or written to.
-    """
-    entry = Path(os.environ.get("XDG_STATE_HOME", ""))
-    where = (entry if entry.is_absolute() else Path.home() / ".local" / "state") / "nerif"
+    """Return the directory, created if it is missing."""
+    home = Path(os.environ.get("XDG_STATE_HOME", ""))
+    where = (home if home.is_absolute() else Path.home() / ".local" / "state") / "nerif"
     try:
         where.mkdir(mode=0o700, parents=True, exist_ok=True)
     except OSError as error:
@@ -38,7 +29,7 @@ def _directory() -> Path:
 
 
 def _write(path: Path, content: bytes) -> None:
-    """Write a new file that its owner alone may read."""
+    """Write a new file with mode 600."""
     try:
         with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
             file.write(content)
@@ -48,35 +39,29 @@ def _write(path: Path, content: bytes) -> None:
 
 def _unwritable(where: Path, error: OSError) -> InputError:
     return InputError(
-        f"expected a directory for files that you alone can read, got '{error.strerror or error}'; "
+        f"expected a directory for files that only you can read, got '{error.strerror or error}'; "
         "set XDG_STATE_HOME to a directory that you can write to",
         field=where,
     )
 
 
 def secret() -> bytes:
-    """Return the secret that runs are signed with: made the first time, the same for every server of this user.
-
-    Raises
-    ------
-    InputError
-        If others may have read or written it, or the directory cannot be written to.
-    """
+    """Return the key that signs runs, one per user; InputError if other users may have read or changed it."""
     path = _directory() / "secret"
     if not path.exists():
         part = path.with_name(f".{secrets.token_hex(8)}")
         _write(part, secrets.token_bytes(LENGTH))
-        with suppress(FileExistsError):  # of two servers that start at once, the first gives the secret
+        with suppress(FileExistsError):  # two servers started at once share the key of the first
             os.link(part, path)
         part.unlink()
     with path.open("rb") as file:
         about, content = os.fstat(file.fileno()), file.read()
-    origin_ = os.name != "posix" or (about.st_uid == os.geteuid() and not about.st_mode & 0o077)
-    if not origin_ or len(content) != LENGTH:
+    is_private = os.name != "posix" or (about.st_uid == os.geteuid() and not about.st_mode & 0o077)
+    if not is_private or len(content) != LENGTH:
         got = f"{len(content)} bytes with mode {about.st_mode & 0o777:03o} of user {about.st_uid}"
         raise InputError(
-            f"expected {LENGTH} bytes that you alone can read (mode 600), got {got}; delete it, and start "
-            "runs that wait again from their pages",
+            f"expected {LENGTH} bytes that only you can read (mode 600), got {got}; delete it, and start "
+            "queued runs again from their pages",
             field=path,
         )
     return content
@@ -84,13 +69,12 @@ def secret() -> bytes:
 
 @contextmanager
 def page_leading_to(link: str) -> Iterator[str]:
-    """Give the address of a page that leads to `link`, and remove the page at the end.
+    """Write a page that redirects to `link`, yield its address, and delete it at the end.
 
-    A browser is started with the address in its command line, which every user of the machine can read; `link` holds
-    the token and stands in the page alone.
+    Every user of the machine can read the command line of the browser, so the token in `link` must not be part of it.
     """
     page = _directory() / f"open-{urlsplit(link).port}.html"
-    page.unlink(missing_ok=True)  # of a server that was killed
+    page.unlink(missing_ok=True)  # left by a server that was killed
     to = escape(link)
     _write(
         page,

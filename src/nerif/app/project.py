@@ -1,4 +1,4 @@
-"""A project: a folder and its content, which is read again each time."""
+"""A project: a folder and the files in it."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from nerif.results.directory import LIVE, RUN
 
 __all__ = ["OWN", "Contents", "Project"]
 
-DEEP = 3  # folders below the project in which is looked
-MANY = 20_000  # entries that are looked at
+DEPTH = 3  # levels of folders that are searched
+MOST = 20_000  # entries that are searched
 OWN = ".nerif"
 
 T = TypeVar("T")
@@ -24,17 +24,17 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Contents:
-    """What a project holds, as paths relative to its folder, in the order of their names.
+    """Files of a project as paths relative to its folder, sorted.
 
     Parameters
     ----------
     experiments : folders of images that have views
     calibrations : calibration files (.toml)
     measurements : measurement files (.nc)
-    volumes : volume files (.nc, .vti) that are no part of a result
-    results : result directories, those of runs that go on among them
+    volumes : volume files (.nc, .vti) outside of result directories
+    results : result directories, also of current runs
     films : stores over time (.zarr)
-    unread : what could not be looked into, and why
+    unread : paths that could not be read, with the cause
     """
 
     experiments: tuple[str, ...] = ()
@@ -47,17 +47,7 @@ class Contents:
 
 
 class Project:
-    """A folder, below which everything is read and written.
-
-    Parameters
-    ----------
-    folder : of the project
-
-    Raises
-    ------
-    InputError
-        If it is not a folder.
-    """
+    """A folder; everything is read and written below it."""
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
         self.folder = Path(folder).resolve()
@@ -68,64 +58,52 @@ class Project:
 
     @property
     def name(self) -> str:
-        """Name of the folder."""
+        """Name of the folder, or its path if it has none."""
         return self.folder.name or str(self.folder)
 
     @property
     def writable(self) -> bool:
-        """Whether files may be written into the folder; where they may not, everything can still be looked at."""
+        """Whether files may be written into the folder."""
         return os.access(self.folder, os.W_OK)
 
     def path(self, name: str | os.PathLike[str]) -> Path:
-        """Return the path of something in the folder, whether it is there or not.
-
-        Raises
-        ------
-        InputError
-            If it is, or a link in it leads, outside of the folder.
-        """
+        """Return the absolute path of a name; InputError if it, or a link in it, leads outside of the folder."""
         if "\0" in str(name):
-            raise InputError("expected the name of a file, got one with a zero in it", field="path")
+            raise InputError("expected the name of a file, got one with a null character", field="path")
         path = (self.folder / name).resolve()
         if not path.is_relative_to(self.folder):
             raise InputError(f"expected something in {self.folder}, got '{name}', which is outside of it", field="path")
         return path
 
     def relative(self, path: str | os.PathLike[str]) -> str:
-        """Return a path in the folder relative to it, as the command line is given it."""
+        """Return a path relative to the folder, as the command line takes it."""
         return str(self.path(path).relative_to(self.folder))
 
-    def free_name(self, stem: str, occupied: Collection[str] = ()) -> str:
-        """Return the first of stem, stem-2, stem-3, ... that is not there, nor among the names `taken`."""
+    def free_name(self, stem: str, reserved: Collection[str] = ()) -> str:
+        """Return the first of stem, stem-2, stem-3, ... that neither exists nor is in `reserved`."""
         first, ending = os.path.splitext(stem)
-        names = (stem if i == 1 else f"{first}-{i}{ending}" for i in range(1, MANY))
-        return next(name for name in names if name not in occupied and not self.path(name).exists())
+        names = (stem if i == 1 else f"{first}-{i}{ending}" for i in range(1, MOST))
+        return next(name for name in names if name not in reserved and not self.path(name).exists())
 
     def views(self, experiment: str) -> tuple[View, ...]:
-        """Return the views of a folder of images; InputError where there are none."""
+        """Return the views of a folder of images; InputError if there are none."""
         return find_views(self.path(experiment))
 
     def cached(self, name: str, what: str, read: Callable[[Path], T]) -> T:
-        """Return what `read` makes of a file, kept until the file changes.
-
-        Parameters
-        ----------
-        name : of the file
-        what : of it is kept, such as "thumbnail"
-        """
+        """Return `read` of a file, cached under `what` until the file changes."""
         path = self.path(name)
-        outcome = path.stat()
-        stamp, key = (outcome.st_mtime_ns, outcome.st_size), (str(path), what)
-        memory = self._cache.get(key)
-        if memory is None or memory[0] != stamp:
-            memory = self._cache[key] = (stamp, read(path))
-        return memory[1]  # type: ignore[return-value]
+        status = path.stat()
+        stamp, key = (status.st_mtime_ns, status.st_size), (str(path), what)
+        entry = self._cache.get(key)
+        if entry is None or entry[0] != stamp:
+            entry = self._cache[key] = (stamp, read(path))
+        return entry[1]  # type: ignore[return-value]
 
     def contents(self) -> Contents:
-        """Look through the folder."""
-        outcome: dict[str, list[str]] = {name: [] for name in Contents.__dataclass_fields__ if name != "unread"}
+        """Search the folder."""
+        names: dict[str, list[str]] = {name: [] for name in Contents.__dataclass_fields__ if name != "unread"}
         unread: list[tuple[str, str]] = []
-        for path in self._walk(self.folder, DEEP, [0], unread):
+        for path in self._walk(self.folder, DEPTH, [0], unread):
             name = str(path.relative_to(self.folder))
             try:
                 if not path.resolve().is_relative_to(self.folder):
@@ -138,11 +116,11 @@ class Project:
                 unread.append((name, str(error)))
                 continue
             if kind:
-                outcome[kind].append(name)
-        return Contents(**{k: tuple(sorted(v)) for k, v in outcome.items()}, unread=tuple(unread))
+                names[kind].append(name)
+        return Contents(**{k: tuple(sorted(v)) for k, v in names.items()}, unread=tuple(unread))
 
-    def _walk(self, folder: Path, deep: int, visible: list[int], unread: list[tuple[str, str]]) -> Iterator[Path]:
-        """The folder itself, its files, and the folders in it that are no store or result themselves."""
+    def _walk(self, folder: Path, depth: int, count: list[int], unread: list[tuple[str, str]]) -> Iterator[Path]:
+        """Yield the folder, its files and its folders; stores and results are not searched further."""
         yield folder
         try:
             entries = sorted(os.scandir(folder), key=lambda e: e.name)
@@ -150,8 +128,8 @@ class Project:
             unread.append((str(folder.relative_to(self.folder)), error.strerror or str(error)))
             return
         for entry in entries:
-            visible[0] += 1
-            if entry.name.startswith(".") or visible[0] > MANY:
+            count[0] += 1
+            if entry.name.startswith(".") or count[0] > MOST:
                 continue
             path = Path(entry.path)
             if not entry.is_dir(follow_symlinks=False):
@@ -159,11 +137,11 @@ class Project:
             elif path.suffix == ".zarr" or _is_result(path):
                 yield path
                 yield from (p for p in (path / "measurement.nc",) if p.is_file())
-            elif deep:
-                yield from self._walk(path, deep - 1, visible, unread)
+            elif depth:
+                yield from self._walk(path, depth - 1, count, unread)
 
     def _kind(self, path: Path) -> str:
-        """Name of the list of Contents that it belongs to; empty if to none."""
+        """Name of the field of Contents that a path belongs to, empty if none."""
         if path.is_dir():
             if path.suffix == ".zarr":
                 return "films"
@@ -184,7 +162,7 @@ def _is_result(path: Path) -> bool:
 def _has_views(path: Path) -> bool:
     try:
         return bool(find_views(path))
-    except InputError:  # nothing that nerif displacement could go by
+    except InputError:
         return False
 
 

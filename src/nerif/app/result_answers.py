@@ -1,6 +1,6 @@
-"""Answers of the server beside its pages: the report of a result, isosurfaces of a quantity and of a run that goes on.
+"""Responses of the server other than pages: reports and isosurfaces.
 
-A report may come from another person: it is shown in a sandbox without access to this server.
+A report may come from another machine, so it is sandboxed and cannot reach this server.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ SANDBOX = (
     "sandbox allow-scripts allow-downloads; default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
     "img-src data: blob:; font-src data:; frame-ancestors 'self'; base-uri 'none'; form-action 'none'"
 )
-KEPT = "private, max-age=3600"  # the address changes with the file
+CACHE = "private, max-age=3600"  # the address changes with the file
 
 Answer = Callable[[Request], Awaitable[Response]]
 
 
 def report_file(path: Path) -> Path:
-    """Return where the report of a result directory, or of a store over time, is written to."""
+    """Return the path of the report of a result directory or of a store over time."""
     return path.with_suffix(".html") if path.suffix == ".zarr" else path / REPORT
 
 
@@ -47,7 +47,7 @@ def surface_address(name: str, quantity: str, level: float, frame: int, stamp: i
 
 
 def live_address(name: str, stamp: int) -> str:
-    """Return the address of the isosurface of a run's last look."""
+    """Return the address of the isosurface of the last preview of a run."""
     return "/live-surface?" + urlencode({"of": name, "stamp": stamp}, quote_via=quote)
 
 
@@ -59,7 +59,7 @@ def _report(work: Workspace) -> Answer:
             return PlainTextResponse(str(error), 404)
         if not file.is_file():
             return PlainTextResponse("There is no report yet: nerif report writes it.", 404)
-        headers = {"content-security-policy": SANDBOX, "cache-control": KEPT}
+        headers = {"content-security-policy": SANDBOX, "cache-control": CACHE}
         return FileResponse(file, media_type="text/html; charset=utf-8", headers=headers)
 
     return answer
@@ -76,7 +76,7 @@ def _surface(work: Workspace) -> Answer:
             stl = await work.beside(made, query.get("of", ""), query.get("quantity", ""), level, frame)
         except (InputError, ValueError) as error:
             return PlainTextResponse(str(error), 404)
-        return Response(stl, media_type="model/stl", headers={"cache-control": KEPT})
+        return Response(stl, media_type="model/stl", headers={"cache-control": CACHE})
 
     return answer
 
@@ -85,7 +85,7 @@ def _live(work: Workspace) -> Answer:
     def made(name: str) -> bytes:
         look = read_look(work.project.path(name))
         if look is None:
-            raise InputError("There is no look at the field yet.")
+            raise InputError("There is no preview of the field yet.")
         volume = look.volume
         return stl_of(surface_triangles(volume, default_level(volume)))
 
@@ -94,10 +94,9 @@ def _live(work: Workspace) -> Answer:
             stl = await work.beside(made, request.query_params.get("of", ""))
         except InputError as error:
             return PlainTextResponse(str(error), 404)
-        return Response(stl, media_type="model/stl", headers={"cache-control": KEPT})
+        return Response(stl, media_type="model/stl", headers={"cache-control": CACHE})
 
     return answer
 
 
 ROUTES: dict[str, Callable[[Workspace], Answer]] = {"/report": _report, "/surface": _surface, "/live-surface": _live}
-"""Paths, and what makes their answer."""

@@ -1,4 +1,4 @@
-"""A result, or a film, to be looked at: slices beside those of another, the difference, time, uncertainty, surfaces."""
+"""Viewer of a result or film: slices, comparison with another one, time, standard deviation, isosurfaces."""
 
 from __future__ import annotations
 
@@ -27,19 +27,19 @@ from nerif.results.directory import VOLUME
 __all__ = ["ResultLook"]
 
 PLAY_EVERY = 0.25  # seconds a frame
-CLOSE = 0.5 + 1e-6  # of the time between frames: instants that are compared are no farther apart
+CLOSE = 0.5 + 1e-6  # of the frame interval: largest distance in time of frames that are compared
 
 
 class ResultLook:
-    """The images of one result in one tab; `build` fills the place that is being built.
+    """The images of one result in one tab.
 
     Parameters
     ----------
     work : Workspace
-    name : of the result, relative to the project
-    others : names of those it can be compared with
-    draft : what was chosen before; changed with what is chosen
-    keep : called when it has changed
+    name : result, relative to the project
+    others : results to compare with
+    draft : earlier choices, updated in place
+    keep : called when the draft has changed
     """
 
     def __init__(
@@ -53,7 +53,7 @@ class ResultLook:
     # -- controls ------------------------------------------------------------------------------------------------
 
     async def build(self) -> None:
-        """Build controls and images; InputError in words where there is nothing to see."""
+        """Build controls and images, or the reason why there are none."""
         try:
             self.source = await self.work.beside(self._open, self.name)
             quantities = [q for q in self.source.quantities if not q.endswith("_std")]
@@ -61,22 +61,22 @@ class ResultLook:
             text_html(f"{error}.", classes="note")
             return
         if not quantities:
-            text_html(f"{self.name}: no field in it.", classes="note")
+            text_html(f"{self.name}: it contains no field.", classes="note")
             return
-        memory = str(self.draft.get("quantity", ""))
+        quantity = str(self.draft.get("quantity", ""))
         options = {q: describe(q)[1].capitalize() for q in quantities}
         with ui.element("div").classes("choices"):
-            self.quantity = _select("Quantity", options, memory if memory in options else quantities[0])
+            self.quantity = _select("Quantity", options, quantity if quantity in options else quantities[0])
             against = str(self.draft.get("against", ""))
             choices = {"": "Nothing", **{name: name for name in self.others}}
             self.against = _select("Compare with", choices, against if against in choices else "")
             self.spread = ui.switch("Standard deviation", value=bool(self.draft.get("spread")))
         for control in (self.quantity, self.against, self.spread):
-            control.on_value_change(self._chosen)
+            control.on_value_change(self._update_draft)
         self.time: RangeSlider | None = None
         if len(self.source.frames) > 1:
             self._build_time()
-        self.lines = ui.html("", sanitize=False).props("aria-live=polite")
+        self.note = ui.html("", sanitize=False).props("aria-live=polite")
         self.slices = SlicesView(self.work)
         await self.draw()
 
@@ -90,7 +90,7 @@ class ResultLook:
 
         with ui.element("div").classes("time"):
             self.play = ui.button(icon="play_arrow", on_click=self._play).props("round unelevated dense")
-            self.play.props["aria-label"] = "Play or halt the film"
+            self.play.props["aria-label"] = "Play or pause the film"
 
             def text(step: int) -> str:
                 return f"{source.times[source.frames[step]] * 1e3:.4g} ms (frame {source.frames[step] + 1})"
@@ -104,17 +104,17 @@ class ResultLook:
             self.play.props("icon=play_arrow")
             return
 
-        async def on() -> None:
+        async def advance() -> None:
             assert self.source is not None
             assert self.time is not None
             self.step = (self.step + 1) % len(self.source.frames)
             self.time.put(self.step)
             await self.draw()
 
-        self._playing = ui.timer(PLAY_EVERY, on)
+        self._playing = ui.timer(PLAY_EVERY, advance)
         self.play.props("icon=pause")
 
-    async def _chosen(self) -> None:
+    async def _update_draft(self) -> None:
         self.draft |= {
             "quantity": self.quantity.value, "against": self.against.value, "spread": bool(self.spread.value),
         }  # fmt: skip
@@ -125,28 +125,28 @@ class ResultLook:
 
     @property
     def frame(self) -> int:
-        """The frame that is shown; 0 of a result of one instant."""
+        """The current frame; 0 for a result of one instant."""
         assert self.source is not None
         return self.source.frames[self.step]
 
     async def draw(self) -> None:
-        """Draw everything as it is chosen now."""
+        """Draw the selected quantity at the current step."""
         assert self.source is not None
-        has = f"{self.quantity.value}_std" in self.source.quantities
-        self.spread.set_visibility(has)
-        quantity = f"{self.quantity.value}_std" if has and self.spread.value else self.quantity.value
+        available = f"{self.quantity.value}_std" in self.source.quantities
+        self.spread.set_visibility(available)
+        quantity = f"{self.quantity.value}_std" if available and self.spread.value else self.quantity.value
         try:
             panels, note = await self.work.beside(self._panels, quantity, self.against.value, self.step)
         except InputError as error:
             panels, note = [], f"{error}."
-        self.lines.set_content(f"<p class=note>{escape(note)}</p>" if note else "")
+        self.note.set_content(f"<p class=note>{escape(note)}</p>" if note else "")
         await self.slices.show(panels)
 
     def _open(self, name: str) -> Source:
         return source_of(self.work.project.path(name))
 
     def _panels(self, quantity: str, against: str, step: int) -> tuple[list[Panel], str]:
-        """What is shown side by side, and what is to be said of it."""
+        """The panels to draw side by side, and a note about them."""
         source = self.source
         assert source is not None
         first, limits = source.volume(quantity, source.frames[step]), source.limits(quantity)
@@ -155,25 +155,25 @@ class ResultLook:
             return [Panel(describe(quantity)[1].capitalize(), first, limits, unit, colours)], ""
         other = self._open(against)
         if quantity not in other.quantities:
-            raise InputError(f"there is no {describe(quantity)[1]} in it to compare with", field=against)
+            raise InputError(f"it has no {describe(quantity)[1]} to compare with", field=against)
         second = other.volume(quantity, self._at(other, against, step))
-        beside = other.limits(quantity)
-        limits = min(limits[0], beside[0]), max(limits[1], beside[1])
+        other_limits = other.limits(quantity)
+        limits = min(limits[0], other_limits[0]), max(limits[1], other_limits[1])
         grid = common_grid(first, second)
-        apart = difference(first, second, grid)
-        ends = map_range(apart.values.numpy(), True, 0.998)
+        change = difference(first, second, grid)
+        ends = map_range(change.values.numpy(), True, 0.998)
         panels = [
             Panel(self.name, resampled(first, grid), limits, unit, colours),
             Panel(against, resampled(second, grid), limits, unit, colours),
-            Panel(f"{against} minus {self.name}", apart, ends, unit, DIVERGING),
+            Panel(f"{against} minus {self.name}", change, ends, unit, DIVERGING),
         ]
         if first.grid == second.grid:
             return panels, ""
         shape = " × ".join(str(n) for n in grid.shape[::-1])
-        return panels, f"The grids differ: both are shown on {shape} voxels (x, y, z), trilinear between theirs."
+        return panels, f"The grids differ: both fields are interpolated trilinearly to {shape} voxels (x, y, z)."
 
     def _at(self, other: Source, against: str, step: int) -> int:
-        """The frame of another source at the instant of a step."""
+        """The frame of another source that is nearest in time to a step."""
         source = self.source
         assert source is not None
         now = source.times[source.frames[step]]
@@ -181,7 +181,7 @@ class ResultLook:
         if abs(other.times[nearest] - now) > CLOSE * min(_interval(source.times), _interval(other.times)):
             at, closest = (f"{time * 1e3:.4g} ms" for time in (now, other.times[nearest]))
             raise InputError(
-                f"expected a frame at {at} to compare with, got {closest} as the nearest that is done; "
+                f"expected a frame at {at} to compare with, got {closest} as the nearest complete frame; "
                 "choose another instant",
                 field=against,
             )
@@ -190,40 +190,40 @@ class ResultLook:
     # -- in three dimensions -------------------------------------------------------------------------------------
 
     async def surfaces(self) -> None:
-        """Build the isosurface of what is chosen."""
+        """Build the isosurface of the selected quantity."""
         if self.source is None:
             text_html("There is no field to show yet.", classes="note")
             return
         quantity, against = self.quantity.value, self.against.value
-        volume, limits, level = await self.work.beside(self._surface, quantity)
+        volume, limits, level = await self.work.beside(self._volume, quantity)
         if min(volume.grid.shape) < 2:
-            text_html("The field is a plane: there is no surface in it.", classes="note")
+            text_html("The field is a plane and has no isosurface.", classes="note")
             return
         view = SurfaceView(quantity, _unit(volume), limits, level, volume.grid.box)
-        display = [self._shown(self.name, self.frame)]
+        surfaces = [self._surface_of(self.name, self.frame)]
         if against:
             other = await self.work.beside(self._open, against)
-            display.append(self._shown(against, self._at(other, against, self.step)))
-        view.show(display)
+            surfaces.append(self._surface_of(against, self._at(other, against, self.step)))
+        view.show(surfaces)
 
-    def _surface(self, quantity: str) -> tuple[Volume, tuple[float, float], float]:
+    def _volume(self, quantity: str) -> tuple[Volume, tuple[float, float], float]:
         assert self.source is not None
         volume = self.source.volume(quantity, self.frame)
         return volume, self.source.limits(quantity), self.source.level(quantity)
 
-    def _shown(self, name: str, frame: int) -> Surface:
+    def _surface_of(self, name: str, frame: int) -> Surface:
         path = self.work.project.path(name)
         file = path / ("zarr.json" if path.suffix == ".zarr" else VOLUME)
         return Surface(name, frame, file.stat().st_mtime_ns if file.is_file() else 0)
 
 
 def _interval(times: Sequence[float]) -> float:
-    """The time between frames; infinite of a single one."""
+    """The median time between frames, infinite for a single one."""
     return median(b - a for a, b in pairwise(times)) if len(times) > 1 else math.inf
 
 
 def _unit(volume: Volume) -> str:
-    """The unit as people write it; nothing of a pure number."""
+    """The unit for display, empty for a pure number."""
     return unit_shown(LABELS.get(volume.quantity.removesuffix("_std"), ("", volume.unit))[1])
 
 

@@ -1,4 +1,4 @@
-"""The results of a project in a table: verdict, error figures, how the run ended."""
+"""Table of the results of a project: verdict, errors, outcome of the run."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from nerif.results.directory import LIVE, METRICS, RUN, VOLUME, Result, ResultDi
 
 __all__ = ["Row", "result_table", "rows_of"]
 
-HEAD = ("Name", "Method", "Verdict", "Likely error", "Views, worst rms", "Outcome", "Time", "Ended")
+HEAD = ("Name", "Method", "Verdict", "Estimated error", "Views, worst rms", "Outcome", "Time", "Ended")
 CLASSES = {"use": "good", "use with care": "care", "do not use": "bad"}
 
 
@@ -31,11 +31,11 @@ class Row:
     Parameters
     ----------
     name : relative to the project
-    cells : of the table, after the name
-    word : of the verdict
-    sentence : the verdict in full, or what is missing
-    figures : names and values by which to trust it
-    film : whether it is one over time
+    cells : cells of the table after the name
+    word : verdict in short
+    sentence : verdict in full, or the missing data
+    figures : names and values of the error estimates
+    film : whether it is a store over time
     """
 
     name: str
@@ -47,35 +47,35 @@ class Row:
 
 
 def rows_of(project: Project, contents: Contents) -> list[Row]:
-    """Return the rows of a project: results, then films; measurements over time are no films."""
+    """Return the rows of the results and then those of the films."""
     rows = [_cached(project, name) for name in contents.results]
     return rows + [row for name in contents.films if (row := _film(project, name)) is not None]
 
 
 def _cached(project: Project, name: str) -> Row:
-    """A row, read again when the newest of its files has changed."""
+    """The row of a result, cached until the newest of its files changes."""
     out = ResultDirectory(project.path(name))
     last = max(filter(out.has, (METRICS, FIELD, RUN, LIVE, VOLUME)), key=lambda n: (out / n).stat().st_mtime_ns)
     return project.cached(f"{name}/{last}", "row", lambda _: _of(name, out.read(views=False)))
 
 
 def _of(name: str, result: Result) -> Row:
-    match, metrics = verdict(result), result.metrics
+    judgement, metrics = verdict(result), result.metrics
     views = [v for v in metrics.get("views", []) if v.get("rms") is not None]
     worst = rms_with_unit(max(views, key=lambda v: float(v["rms"])), 3) if views else ""
     outcome = str(metrics.get("outcome") or result.about.get("outcome") or "not ended").replace("_", " ")
     seconds = metrics.get("seconds", result.about.get("seconds"))
-    error = "" if match.error is None else f"{match.error:.1%} of the variation"
-    ended, word, sentence = bool(metrics), match.word, match.sentence
+    error = "" if judgement.error is None else f"{judgement.error:.1%} of the variation"
+    ended, word, sentence = bool(metrics), judgement.word, judgement.sentence
     if not ended:
-        word, sentence = "", " ".join(gap.sentence for gap in result.missing) or "Nothing of it is known yet."
+        word, sentence = "", " ".join(gap.sentence for gap in result.missing) or "No data yet."
     time = "" if seconds is None else f"{float(seconds):.0f} s"
     cells = (result.method, word, error, worst, outcome, time, str(result.about.get("finished", "")))
     return Row(name, cells, word, sentence, tuple(accuracy_rows(result)) if ended else ())
 
 
 def _film(project: Project, name: str) -> Row | None:
-    """A row of a film; None of a store that holds measurements."""
+    """The row of a film, None for a store of measurements."""
     try:
         store = VolumeSequence(project.path(name))
     except InputError:
@@ -86,11 +86,11 @@ def _film(project: Project, name: str) -> Row | None:
     grid = " × ".join(str(n) for n in store.grid.shape[::-1])
     figures = (("Frames", f"{done} of {count}"), ("Time", span), ("Voxels", f"{grid} (x, y, z)"))
     cells = (f"film, {count} frames", "", "", "", outcome, span, "")
-    return Row(name, cells, "", f"{done} of {count} frames can be shown.", figures, film=True)
+    return Row(name, cells, "", f"{done} of {count} frames are complete.", figures, film=True)
 
 
 def result_table(rows: Sequence[Row], selection: str, choose: Callable[[str], Awaitable[None]]) -> None:
-    """Build the table, with a button in each row that shows it."""
+    """Build the table, with a button per row that selects it."""
     around = ui.element("div").classes("tabled").props('tabindex=0 role=region aria-label="Results"')
     with around, ui.element("table"):
         with ui.element("thead"), ui.element("tr"):
@@ -101,12 +101,12 @@ def result_table(rows: Sequence[Row], selection: str, choose: Callable[[str], Aw
                 _line(row, row.name == selection, choose)
 
 
-def _line(row: Row, selection: bool, choose: Callable[[str], Awaitable[None]]) -> None:
-    with ui.element("tr").classes("chosen" if selection else ""):
+def _line(row: Row, active: bool, choose: Callable[[str], Awaitable[None]]) -> None:
+    with ui.element("tr").classes("chosen" if active else ""):
         with ui.element("th").props("scope=row"):
             button = ui.button(row.name, on_click=lambda: choose(row.name)).props("flat dense no-caps align=left")
             button.props["aria-label"] = f"Show {row.name}"
-            button.props["aria-pressed"] = "true" if selection else "false"
+            button.props["aria-pressed"] = "true" if active else "false"
         for title, cell in zip(HEAD[1:], row.cells, strict=True):
             verdict_class = f"verdict {CLASSES.get(row.word, '')}" if title == "Verdict" and cell else ""
             ui.html(escape(cell), sanitize=False, tag="td").classes(verdict_class)

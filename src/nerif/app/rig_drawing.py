@@ -1,4 +1,4 @@
-"""The rig from above, to scale, as SVG: cameras, what the images see, backgrounds, the flow."""
+"""The rig from above as SVG, to scale: cameras, fields of view, backgrounds, flow."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from nerif.geometry import Camera
 
 __all__ = ["rig_drawing"]
 
-EDGE = 0.06  # of the drawing, around it
-SIZE = 1000.0  # units of the drawing along its longer side
+EDGE = 0.06  # margin, relative to the drawing
+SIZE = 1000.0  # longer side, units of the drawing
 
 
 def rig_drawing(cameras: Sequence[Camera], flow_size: float) -> str:
-    """Return an SVG of cameras and backgrounds from above, with a scale.
+    """Return an SVG of cameras and backgrounds with a scale bar.
 
     Parameters
     ----------
-    cameras : with backgrounds
+    cameras : cameras with backgrounds
     flow_size : diameter of the flow, mm
     """
     rays = [_outline(camera) for camera in cameras]
@@ -36,10 +36,10 @@ def rig_drawing(cameras: Sequence[Camera], flow_size: float) -> str:
         y = height - (float(point[1] - low[1]) + EDGE * reach) * unit
         return f"{x:.1f},{y:.1f}"
 
-    visible, things = [], []
+    views, things = [], []
     for camera, (lens, ends) in zip(cameras, rays, strict=True):
         corners = " ".join(map(at, (lens[0], ends[0], ends[1], lens[1])))
-        visible.append(f'<polygon points="{corners}" fill="var(--plot)" opacity="0.07"/>')
+        views.append(f'<polygon points="{corners}" fill="var(--plot)" opacity="0.07"/>')
         a, b = (at(end).split(",") for end in ends)
         things.append(
             f'<line x1="{a[0]}" y1="{a[1]}" x2="{b[0]}" y2="{b[1]}" stroke="currentColor" stroke-width="5">'
@@ -58,13 +58,13 @@ def rig_drawing(cameras: Sequence[Camera], flow_size: float) -> str:
         f'stroke="currentColor" stroke-width="2.5"/><text x="20" y="{height - 34:.1f}" font-size="22" '
         f'fill="currentColor">{bar:g} mm</text>'
     )
-    lines = f"The rig from above, to scale: {len(cameras)} cameras, their backgrounds, and the flow between them"
-    inside = "".join((*visible, flow, *things, scale))
-    return f'<svg viewBox="0 0 {width:.0f} {height:.0f}" role="img" aria-label="{lines}">{inside}</svg>'
+    label = f"The rig from above, to scale: {len(cameras)} cameras, their backgrounds, and the flow between them"
+    inside = "".join((*views, flow, *things, scale))
+    return f'<svg viewBox="0 0 {width:.0f} {height:.0f}" role="img" aria-label="{label}">{inside}</svg>'
 
 
 def _outline(camera: Camera) -> tuple[torch.Tensor, torch.Tensor]:
-    """Where the outermost rays of the middle row begin and end, (2, 2) in mm from above."""
+    """Start and end of the two outermost rays of the middle row in x and y, (2, 2) in mm."""
     height, width = camera.image_size
     ends = torch.tensor([[0.0, (height - 1) / 2], [width - 1.0, (height - 1) / 2]], dtype=torch.float64)
     rays = camera.rays(ends)

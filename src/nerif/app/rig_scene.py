@@ -1,4 +1,4 @@
-"""The rig in 3-D, turned with the mouse: fields of view, backgrounds, box; and a table of the cameras."""
+"""The rig in 3-D: cameras, fields of view, backgrounds and box; and a table of the cameras."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ from nerif.report.rig_figure import COLOURS, image_corners
 
 __all__ = ["Rig", "read_rig", "show_rig"]
 
-SIZE = 5.0  # of the rig in the scene
-TIP = 0.18  # of the rig: length of the pyramid of a camera
-BEYOND = "#bcc5cd"  # colour of what the camera sees beyond that, as far as its background
-HEAD = ("Camera", "Image [px]", "Focal length [px]", "Place x, y, z [mm]", "Images used", "rms [px]")
+SIZE = 5.0  # extent of the rig in the scene
+TIP = 0.18  # length of the pyramid of a camera, relative to the rig
+BEYOND = "#bcc5cd"  # colour of the rays from there to the background
+HEAD = ("Camera", "Image [px]", "Focal length [px]", "Position x, y, z [mm]", "Images used", "rms [px]")
 
 
 @dataclass(frozen=True)
 class Rig:
-    """A calibration file as it is shown.
+    """Contents of a calibration file.
 
     Parameters
     ----------
-    cameras : those that can be drawn
-    missing : what is not known of the others
-    box : or None
-    errors : of the images of the calibration, none if the file has none
+    cameras : cameras that can be drawn
+    missing : data that the other cameras lack
+    box : measurement volume
+    errors : reprojection errors of the calibration images, empty if the file has none
     """
 
     cameras: tuple[Camera, ...]
@@ -44,7 +44,7 @@ class Rig:
 
 
 def read_rig(path: Path) -> Rig:
-    """Read a calibration file; InputError if it is none."""
+    """Read a calibration file."""
     cameras, missing = [], []
     for camera in import_cameras(path):
         try:
@@ -62,10 +62,10 @@ def show_rig(rig: Rig) -> None:
         return
     camera = ui.scene.perspective_camera(fov=38)
     scene = ui.scene(width=1080, height=460, grid=False, camera=camera, background_color="#eef1f4")
-    scene.classes("surface").props('role=img aria-label="The rig; drag to turn, scroll to come nearer"')
+    scene.classes("surface").props('role=img aria-label="The rig; drag to turn, scroll to zoom"')
     middle = np.zeros(3) if rig.box is None else np.array(rig.box.centre)
-    visible = [image_corners(c, middle) for c in rig.cameras]
-    points = np.concatenate([np.concatenate([s.start, s.end]) for s in visible] + [middle[None]])
+    outlines = [image_corners(c, middle) for c in rig.cameras]
+    points = np.concatenate([np.concatenate([s.start, s.end]) for s in outlines] + [middle[None]])
     centre, reach = (points.max(axis=0) + points.min(axis=0)) / 2, float(np.ptp(points, axis=0).max()) or 1.0
     scale = SIZE / reach
 
@@ -77,7 +77,7 @@ def show_rig(rig: Rig) -> None:
             line(a, b, colour)
 
     with scene:
-        for i, (one, corners) in enumerate(zip(rig.cameras, visible, strict=True)):
+        for i, (one, corners) in enumerate(zip(rig.cameras, outlines, strict=True)):
             colour = COLOURS[i % len(COLOURS)]
             tips = corners.start + TIP * reach * corners.direction
             outline(tips, colour)
@@ -109,10 +109,10 @@ def show_rig(rig: Rig) -> None:
 def _table(cameras: Sequence[Camera], errors: Sequence[ImageError]) -> str:
     rows = []
     for camera in cameras:
-        local = [e for e in errors if e.camera == camera.name]
+        camera_errors = [e for e in errors if e.camera == camera.name]
         height, width = camera.image_size
-        used = f"{sum(e.used for e in local)} of {len(local)}" if local else "unknown"
-        rms = f"{rms_of(local):.3f}" if any(e.used for e in local) else "unknown"
+        used = f"{sum(e.used for e in camera_errors)} of {len(camera_errors)}" if camera_errors else "unknown"
+        rms = f"{rms_of(camera_errors):.3f}" if any(e.used for e in camera_errors) else "unknown"
         place = ", ".join(f"{round(float(x), 1) + 0.0:.1f}" for x in camera.centre)
         cells = (f"{width} × {height}", f"{float(camera.intrinsics[0, 0]):.1f}", place, used, rms)
         line = "".join(f"<td>{escape(cell)}</td>" for cell in cells)

@@ -1,7 +1,7 @@
-"""One run as a process of its own, which goes on when the server ends: `python -m nerif.app.runner DIRECTORY`.
+"""Run nerif in a process that outlives the server: `python -m nerif.app.runner DIRECTORY`.
 
-Its standard input gives the arguments of nerif as JSON, once the run is its own; where that ends without any, because
-the server was killed, nothing is started. It writes down who runs (process and when it was started), and how it ended.
+The arguments of nerif come as JSON on standard input; if it ends without any (the server was killed), nothing starts.
+The process id with its start time, and later the exit code, are written to the directory.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ def main(directory: Path, words: Sequence[str]) -> None:
     """Run nerif with these arguments and wait for its end."""
     import psutil
 
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell ignores it for background jobs
-    arguments = [sys.executable, "-P", "-m", "nerif", *words]  # -P: no module of the folder is imported
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may have set it to be ignored
+    arguments = [sys.executable, "-P", "-m", "nerif", *words]  # -P: import no module of the folder
     environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
     with (directory / LOG).open("ab") as log:
         process = subprocess.Popen(

@@ -1,4 +1,4 @@
-"""The scale of a slider: whole steps, and the numbers they stand for; logarithmic where these span decades."""
+"""Scale of a slider: whole steps and their values, logarithmic if these span decades."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ from dataclasses import dataclass
 __all__ = ["Scale"]
 
 STEPS = 400
-DECADES = 1.3  # from which on a scale is logarithmic
+DECADES = 1.3  # from this range on a scale is logarithmic
 DIGITS = 3
 
 
 @dataclass(frozen=True)
 class Scale:
-    """Steps 0 to `last` between two numbers.
+    """Steps 0 to `last` between two values.
 
     Parameters
     ----------
-    low, high : what the ends stand for
-    whole : whether only whole numbers are meant
+    low, high : values of the ends
+    whole : whether the values are whole numbers
     """
 
     low: float
@@ -33,11 +33,11 @@ class Scale:
 
     @property
     def logarithmic(self) -> bool:
-        """Whether steps multiply."""
+        """Whether the scale is logarithmic."""
         return not self.whole and self.low > 0 and math.log10(self.high / self.low) >= DECADES
 
     def value(self, step: int) -> float:
-        """Return what a step stands for, in round numbers."""
+        """Return the value of a step, rounded."""
         if step in (0, self.last):
             return self.low if step == 0 else self.high
         share = step / self.last
@@ -46,7 +46,7 @@ class Scale:
         return self.low + step if self.whole else float(f"{self.low + share * (self.high - self.low):.{DIGITS}g}")
 
     def step(self, value: float) -> int:
-        """Return the step nearest to a number; of one beyond an end, that end."""
+        """Return the step nearest to a value, which is clipped to the ends."""
         value = min(max(value, self.low), self.high)
         if self.logarithmic:
             return round(math.log(value / self.low) / math.log(self.high / self.low) * self.last)

@@ -1,4 +1,4 @@
-"""The server: where it listens, who may ask it, which pages it has, and that the queue of runs goes on."""
+"""The server: address, access, pages, and the queue of runs."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ from nerif.app.workspace import READ_ONLY, Workspace
 from nerif.cli.commands.output import say
 from nerif.common.conventions import InputError
 
-__all__ = ["Address", "serve", "without_address"]
+__all__ = ["Address", "is_relevant", "serve"]
 
-TRIED = 20  # ports
+PORTS = 20  # that are tried
 LOCAL = ("127.0.0.1", "localhost", "[::1]")
 EVERYWHERE = ("0.0.0.0", "::")
 QUEUE_EVERY = 0.5  # seconds
@@ -39,13 +39,13 @@ QUEUE_EVERY = 0.5  # seconds
 
 @dataclass(frozen=True)
 class Address:
-    """Where the server listens, and what its addresses must hold.
+    """Host, port and token of the server.
 
     Parameters
     ----------
-    host : name or number to listen on
-    port : to listen on
-    token : of the address
+    host : name or IP address to listen on
+    port : port to listen on
+    token : token that a browser must send
     """
 
     host: str
@@ -54,36 +54,30 @@ class Address:
 
     @classmethod
     def of(cls, host: str, port: int, token: str | None) -> Address:
-        """Return an address with a free port and, on this machine alone, a random token.
-
-        Raises
-        ------
-        InputError
-            If others can reach it and no token is given, or no port is free.
-        """
+        """Return an address with a free port; a host that others can reach needs a token, else it is random."""
         if not _is_local(host):
             if token is None:
                 raise InputError(
-                    f"expected --token together with --host {host}, got none; others can reach that address, and "
-                    "anybody who knows the token can run nerif here and read and write the folder",
+                    f"expected --token together with --host {host}, got none; others can reach that address, and with "
+                    "the token they can run nerif here and read and write the folder",
                     field="host",
                 )
-            say(f"note: others can reach {host}: who knows the token can run nerif here and read and write the folder;")
-            say("      nothing is encrypted on the way. Safer: ssh -L 8620:127.0.0.1:8620 THIS_MACHINE")
-        result = _free_port(host, port)
-        if result != port:
-            say(f"port {port} is taken; {result} is used")
-        return cls(host, result, token or secrets.token_urlsafe(24))
+            say(f"note: others can reach {host}; with the token they can run nerif here and read and write the folder;")
+            say("      the connection is not encrypted. Safer: ssh -L 8620:127.0.0.1:8620 THIS_MACHINE")
+        free = _free_port(host, port)
+        if free != port:
+            say(f"port {port} is in use; using {free}")
+        return cls(host, free, token or secrets.token_urlsafe(24))
 
     @property
     def names(self) -> tuple[str, ...]:
-        """What browsers may call this server: where it listens on all interfaces, by the address of any of them."""
-        local = {self.host}
+        """Host names that a browser may use for this server."""
+        names = {self.host}
         if not _is_local(self.host):
-            local |= {socket.gethostname(), socket.getfqdn()}
+            names |= {socket.gethostname(), socket.getfqdn()}
         if self.host in EVERYWHERE:
-            local |= _interfaces()
-        return (*LOCAL, *sorted(f"[{name}]" if ":" in name else name for name in local))
+            names |= _interfaces()
+        return (*LOCAL, *sorted(f"[{name}]" if ":" in name else name for name in names))
 
     @property
     def link(self) -> str:
@@ -93,17 +87,11 @@ class Address:
 
 
 def serve(folder: Path, address: Address, browser: bool = True) -> None:
-    """Serve the pages of a project until Ctrl-C; runs go on after that.
-
-    Raises
-    ------
-    InputError
-        If the folder is none, or the user's own directory (private.py) cannot be written to.
-    """
+    """Serve the pages of a project until Ctrl-C; runs continue after that."""
     work = Workspace(Project(folder))
     if not work.project.writable:
         say(f"note: {READ_ONLY}")
-    logging.getLogger("uvicorn.error").addFilter(without_address)
+    logging.getLogger("uvicorn.error").addFilter(is_relevant)
     app.add_middleware(Guard, token=address.token, hosts=address.names, port=address.port)
     app.add_api_route("/", lambda: RedirectResponse(PAGES[0].path), include_in_schema=False)
     for path, answer in ROUTES.items():
@@ -115,12 +103,12 @@ def serve(folder: Path, address: Address, browser: bool = True) -> None:
         while not Server.instance.started:
             await asyncio.sleep(0.01)
         say(f"{work.project.folder}: {address.link}")
-        say("Ctrl-C ends the server; what runs goes on.")
+        say("Ctrl-C ends the server; runs continue.")
         if first:
             webbrowser.open(first)
 
     app.on_startup(lambda: background_tasks.create(begun()))
-    app.on_startup(lambda: work.beside(work.project.contents))  # the first reading takes longest
+    app.on_startup(lambda: work.beside(work.project.contents))  # fills the cache: the first search takes longest
     app.timer(QUEUE_EVERY, work.jobs.advance)
     with ExitStack() as ending:
         first = ending.enter_context(page_leading_to(address.link)) if browser else ""
@@ -132,7 +120,7 @@ def serve(folder: Path, address: Address, browser: bool = True) -> None:
             )  # fmt: skip
         except KeyboardInterrupt:
             say("")
-    say("The server has ended; nerif app goes on with the same runs.")
+    say("The server has ended; start nerif app to see its runs again.")
 
 
 FAVICON = (
@@ -141,23 +129,23 @@ FAVICON = (
 )
 
 
-def without_address(record: logging.LogRecord) -> bool:
-    """Whether an entry of the server's log is shown: of answers that were given up, since the browser went on, none is.
+def is_relevant(record: logging.LogRecord) -> bool:
+    """Whether a record of the server's log is written: not for a request that the browser has cancelled.
 
-    Starlette's BaseHTTPMiddleware, by which NiceGUI answers, raises RuntimeError for them.
+    Starlette's BaseHTTPMiddleware raises RuntimeError for it.
     """
     error = record.exc_info[1] if record.exc_info else None
     return not (isinstance(error, RuntimeError) and str(error) == "No response returned.")
 
 
 def _built(work: Workspace, page: Page) -> Callable[[], Awaitable[None]]:
-    """The function that builds a page for a browser that asks for it."""
+    """The handler that builds a page within the frame."""
 
     async def build() -> None:
         with frame(work, page, PAGES):
-            waited = page.build(work)
-            if waited is not None:
-                await waited
+            pending = page.build(work)
+            if pending is not None:
+                await pending
 
     return build
 
@@ -170,15 +158,15 @@ def _is_local(host: str) -> bool:
 
 
 def _interfaces() -> set[str]:
-    """The addresses of this machine's network interfaces; its own name may lead to 127.0.1.1 alone."""
-    result = [address for interface in psutil.net_if_addrs().values() for address in interface]
-    return {a.address.partition("%")[0] for a in result if a.family in (socket.AF_INET, socket.AF_INET6)}
+    """The addresses of the network interfaces; the host name may resolve to 127.0.1.1 only."""
+    addresses = [address for interface in psutil.net_if_addrs().values() for address in interface]
+    return {a.address.partition("%")[0] for a in addresses if a.family in (socket.AF_INET, socket.AF_INET6)}
 
 
 def _free_port(host: str, port: int) -> int:
-    """The first port from `port` on that nobody listens on."""
-    reason = "every one of them is taken"
-    for number in range(port, min(port + TRIED, 65536)):
+    """The first free port from `port` on."""
+    reason = "all are in use"
+    for number in range(port, min(port + PORTS, 65536)):
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         with socket.socket(family, socket.SOCK_STREAM) as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -186,9 +174,9 @@ def _free_port(host: str, port: int) -> int:
                 probe.bind((host, number))
                 return number
             except PermissionError:
-                reason = "ports below 1024 are for the system"
+                reason = "ports below 1024 need system rights"
             except socket.gaierror:
                 raise InputError(f"expected an address of this machine, got '{host}'", field="host") from None
             except OSError as error:
                 reason = error.strerror or reason
-    raise InputError(f"expected a free one from {port} on, got none: {reason}; give another --port", field="port")
+    raise InputError(f"expected a free port from {port} on, got none: {reason}; set another --port", field="port")

@@ -1,4 +1,4 @@
-"""Slices across z, y and x, of one volume or of several on one grid side by side: one slider an axis moves them all."""
+"""Slices of volumes on one grid side by side, with one slider per axis."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ NORMALS = "zyx"
 
 @dataclass(frozen=True)
 class Panel:
-    """One volume, as it is shown.
+    """A volume and its display settings.
 
     Parameters
     ----------
-    title : for people
-    volume : all panels of a view have the same grid
-    limits : ends of its colours, in `unit`
-    unit : of the values
+    title : title
+    volume : volume; all panels of a view have the same grid
+    limits : colour range, in `unit`
+    unit : unit of the values
     colours : name of a Matplotlib colour map
     """
 
@@ -41,12 +41,12 @@ class Panel:
 
 
 class SlicesView:
-    """Slices of panels, where the page is being built."""
+    """Slices of panels normal to z, y and x."""
 
     def __init__(self, work: Workspace) -> None:
         self.work = work
         self.panels: Sequence[Panel] = ()
-        self._at = dict.fromkeys(NORMALS, 0.5)  # along each axis, over its length
+        self._at = dict.fromkeys(NORMALS, 0.5)  # position along each axis, relative to its length
         self._waiting: set[str] = set()
         self._busy = False
         self._built: tuple[Any, ...] = ()
@@ -55,7 +55,7 @@ class SlicesView:
         self._place = ui.element("div")
 
     async def show(self, panels: Sequence[Panel]) -> None:
-        """Show these from now on, at the same places."""
+        """Replace the panels; the slice positions stay."""
         self.panels = panels
         built = tuple(p.title for p in panels), panels[0].volume.grid if panels else None
         if built != self._built:
@@ -102,7 +102,7 @@ class SlicesView:
         return min(int(self._at[normal] * count), count - 1)
 
     async def _draw(self) -> None:
-        """Draw what has moved; what moves meanwhile is drawn after it, the last place only."""
+        """Draw the slices that have moved; of moves during the drawing, only the last position is drawn."""
         if self._busy:
             return
         self._busy = True
@@ -110,14 +110,14 @@ class SlicesView:
             while self._waiting:
                 normal = self._waiting.pop()
                 panels, index = self.panels, self._index(normal) if self.panels else 0
-                plot = await self.work.beside(_drawn, panels, normal, index)
+                addresses = await self.work.beside(_slice_addresses, panels, normal, index)
                 if panels is self.panels:
-                    self._put(normal, index, plot)
+                    self._put(normal, index, addresses)
         finally:
             self._busy = False
 
-    def _put(self, normal: str, index: int, plot: Sequence[str]) -> None:
-        for number, (panel, address) in enumerate(zip(self.panels, plot, strict=True)):
+    def _put(self, normal: str, index: int, addresses: Sequence[str]) -> None:
+        for number, (panel, address) in enumerate(zip(self.panels, addresses, strict=True)):
             at = float(panel.volume.grid.axis(normal)[index])
             image = self._images[normal, number]
             image.props["src"] = address
@@ -125,12 +125,12 @@ class SlicesView:
             image.update()
 
 
-def _drawn(panels: Sequence[Panel], normal: str, index: int) -> list[str]:
+def _slice_addresses(panels: Sequence[Panel], normal: str, index: int) -> list[str]:
     return [slice_image(p.volume, normal, index, p.limits, p.colours) for p in panels]
 
 
 def _bars(panels: Sequence[Panel]) -> str:
-    """Colour bars: one for all panels that share it."""
+    """Colour bars as HTML, one for all panels of the same range."""
     shared: dict[tuple[Any, ...], list[str]] = {}
     for panel in panels:
         shared.setdefault((panel.limits, panel.unit, panel.colours), []).append(panel.title)

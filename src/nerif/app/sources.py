@@ -1,4 +1,4 @@
-"""What a page of results draws from: the volumes of a result directory, or of a frame of a film."""
+"""Volumes of a result directory, or of a film frame by frame."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Limits = tuple[float, float]
 
 
 class Source(Protocol):
-    """Volumes of several quantities on one grid, of one instant or of several."""
+    """Volumes of several quantities on one grid, at one or more instants."""
 
     @property
     def quantities(self) -> tuple[str, ...]: ...
@@ -37,12 +37,7 @@ class Source(Protocol):
 
 
 class Still:
-    """A result directory.
-
-    Parameters
-    ----------
-    path : of the directory
-    """
+    """A result directory."""
 
     def __init__(self, path: Path) -> None:
         self.path, self.times = path, (0.0,)
@@ -52,48 +47,32 @@ class Still:
     def _volumes(self) -> dict[str, Volume]:
         file = self.path / VOLUME
         if not file.is_file():
-            raise InputError("there is no field to show yet; it comes when the run has ended", field=self.path.name)
+            raise InputError("the field is not available before the run has ended", field=self.path.name)
         return _read(str(file), file.stat().st_mtime_ns)
 
     @property
     def quantities(self) -> tuple[str, ...]:
-        """What there is: of an index the excess stands for n too; standard deviations beside what they belong to."""
+        """Quantities to display: n only without its excess over ambient, standard deviations after their means."""
         return _worth_showing(self._volumes)
 
     def volume(self, quantity: str, frame: int = 0) -> Volume:
-        """Return one quantity, averaged down if it is large.
-
-        Raises
-        ------
-        InputError
-            If the result lacks it.
-        """
-        outcome = self._volumes
-        if quantity not in outcome:
-            raise InputError(f"expected one of {', '.join(outcome)}, got '{quantity}'", field=self.path.name)
-        return outcome[quantity]
+        """Return one quantity, averaged down if it is large."""
+        volumes = self._volumes
+        if quantity not in volumes:
+            raise InputError(f"expected one of {', '.join(volumes)}, got '{quantity}'", field=self.path.name)
+        return volumes[quantity]
 
     def limits(self, quantity: str) -> Limits:
-        """Return the ends of its colours."""
-        return colour_range(plotted_values(self.volume(quantity)))
+        """Return the colour range."""
+        return colour_range(shown(self.volume(quantity)))
 
     def level(self, quantity: str) -> float:
-        """Return the level of its isosurface to begin with."""
+        """Return the default level of the isosurface."""
         return default_level(self.volume(quantity))
 
 
 class Film:
-    """A store of volumes over time.
-
-    Parameters
-    ----------
-    path : of the Zarr store
-
-    Raises
-    ------
-    InputError
-        If it holds no volumes over time, or none of its frames is done.
-    """
+    """A Zarr store of volumes over time, with at least one complete frame."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -101,7 +80,7 @@ class Film:
         self.times, self.frames = store.times, finished_frames(store)
         self.quantities = _worth_showing(store.quantities)
         if not self.frames:
-            raise InputError("no frame of it is done yet", field=path.name)
+            raise InputError("no frame is complete yet", field=path.name)
 
     @property
     def _stamp(self) -> int:
@@ -112,22 +91,22 @@ class Film:
         return _frame(str(self.path), self._stamp, quantity, frame)
 
     def limits(self, quantity: str) -> Limits:
-        """Return the ends of its colours, those of all frames."""
+        """Return the colour range over all frames."""
         return _over_time(str(self.path), self._stamp, quantity, tuple(self.frames))[0]
 
     def level(self, quantity: str) -> float:
-        """Return the level of its isosurface to begin with, that of all frames."""
+        """Return the default level of the isosurface over all frames."""
         return _over_time(str(self.path), self._stamp, quantity, tuple(self.frames))[1]
 
 
 def source_of(path: Path) -> Source:
-    """Return what can be drawn of a result directory, or of a store over time."""
+    """Open a result directory or a store over time."""
     return Film(path) if path.suffix == ".zarr" else Still(path)
 
 
 def _worth_showing(quantities: Sequence[str] | dict[str, Volume]) -> tuple[str, ...]:
-    memory = [q for q in quantities if q.rpartition("_")[2] not in STATISTICS and (q != "n" or INDEX not in quantities)]
-    return tuple(name for q in memory for name in (q, f"{q}_std") if name in quantities)
+    names = [q for q in quantities if q.rpartition("_")[2] not in STATISTICS and (q != "n" or INDEX not in quantities)]
+    return tuple(name for q in names for name in (q, f"{q}_std") if name in quantities)
 
 
 @lru_cache(maxsize=6)

@@ -1,4 +1,4 @@
-"""Isosurfaces of one or two volumes in their box, to be turned with the mouse."""
+"""Isosurfaces of one or two volumes in a 3-D scene."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from nerif.geometry import Box
 __all__ = ["Surface", "SurfaceView"]
 
 STEPS = 100  # of the slider
-COLOURS = (("#4aa3dd", 1.0), ("#e8853a", 0.55))  # and how opaque
+COLOURS = (("#4aa3dd", 1.0), ("#e8853a", 0.55))  # and opacity
 
 
 @dataclass(frozen=True)
 class Surface:
-    """What an isosurface is of.
+    """Source of an isosurface.
 
     Parameters
     ----------
-    name : of the result or film, relative to the project
-    frame : of a film
-    stamp : that changes with its file
+    name : result or film, relative to the project
+    frame : frame of a film
+    stamp : value that changes with the file
     """
 
     name: str
@@ -40,11 +40,11 @@ class SurfaceView:
 
     Parameters
     ----------
-    quantity : name of it
-    unit : of the level
+    quantity : name of the quantity
+    unit : unit of the level
     limits : ends of the slider
-    level : to begin with
-    box : of the volume, mm
+    level : initial level
+    box : box of the volume, mm
     """
 
     def __init__(self, quantity: str, unit: str, limits: tuple[float, float], level: float, box: Box) -> None:
@@ -57,14 +57,13 @@ class SurfaceView:
             self._draw()
 
         label = f"Level{f', {unit}' if unit else ''}"
-        self._slider = RangeSlider(label, STEPS, min(max(step, 1), STEPS - 1), self._text, move, settled=True)
-        self._named = ui.html("", sanitize=False)
-        # named for those who do not see it: what it shows is in the slices too
-        self.scene = BoxScene(box, "Isosurface; drag to turn, scroll to come nearer")
+        self._slider = RangeSlider(label, STEPS, min(max(step, 1), STEPS - 1), self._text, move, on_release=True)
+        self._legend = ui.html("", sanitize=False)
+        self.scene = BoxScene(box, "Isosurface; drag to turn, scroll to zoom")
 
     @property
     def level(self) -> float:
-        """The level, in the unit of the quantity."""
+        """The current level, in the unit of the quantity."""
         low, high = self.limits
         return low + (high - low) * self._slider.value / STEPS
 
@@ -73,7 +72,7 @@ class SurfaceView:
         return f"{low + (high - low) * step / STEPS:.4g}"
 
     def show(self, surfaces: Sequence[Surface]) -> None:
-        """Show the surfaces of these from now on."""
+        """Replace the surfaces."""
         self.surfaces = surfaces
         self._draw()
 
@@ -86,4 +85,4 @@ class SurfaceView:
             f"<li><i style='background:{colour};opacity:{opacity}'></i>{escape(surface.name)}</li>"
             for surface, (colour, opacity) in zip(self.surfaces, COLOURS, strict=False)
         )
-        self._named.set_content(f"<ul class=legend>{names}</ul>")
+        self._legend.set_content(f"<ul class=legend>{names}</ul>")

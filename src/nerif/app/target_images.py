@@ -1,4 +1,4 @@
-"""Images of the target of one view: the corners found in each, its error, and a button that leaves it out."""
+"""Images of the calibration target: detected points, error, and a button that excludes an image."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ LARGEST = 420  # px
 
 
 class TargetImages:
-    """The images, where the page is being built.
+    """The target images of one view.
 
     Parameters
     ----------
     work : Workspace
-    toggled : called with the name of an image that is left out or used again
+    toggled : called with the name of an image that is excluded or included
     """
 
     def __init__(self, work: Workspace, toggled: Callable[[str], None]) -> None:
@@ -37,16 +37,16 @@ class TargetImages:
 
     async def show(
         self, view: View, targets: Mapping[str, CalibrationTarget], errors: Mapping[str, ImageError],
-        left_out: Collection[str],
+        excluded: Collection[str],
     ) -> None:  # fmt: skip
-        """Show the images of a view, one after the other; a later request replaces an earlier one.
+        """Show the images of a view one after the other; a later call replaces an earlier one.
 
         Parameters
         ----------
-        view : of find_views
-        targets : to look for in the images in space and on the background
-        errors : by the name of the image
-        left_out : names of images
+        view : view of an experiment
+        targets : targets in space and on the background
+        errors : errors by the name of the image
+        excluded : names of images
         """
         self._turn += 1
         turn = self._turn
@@ -71,7 +71,7 @@ class TargetImages:
                 name = f"{view.name}/{source}/{pose}"
                 try:
                     address = await self.work.beside(self.files.image, view, source, number, LARGEST, view.crop)
-                    outcome = await self.work.beside(self.files.result, view, source, number, targets[source])
+                    detection = await self.work.beside(self.files.found, view, source, number, targets[source])
                     shape = await self.work.beside(self._shape, view, source)
                 except InputError as error:
                     with grid:
@@ -80,66 +80,66 @@ class TargetImages:
                 if turn != self._turn:
                     return
                 with grid:
-                    self._cell(name, address, outcome, shape, errors, name in left_out)
+                    self._cell(name, address, detection, shape, errors, name in excluded)
 
     def _shape(self, view: View, source: str) -> tuple[int, int]:
         shape = view.open(source).shape
         return view.crop.shape_of(shape) if view.crop else shape
 
     def _cell(
-        self, name: str, address: str, outcome: Detection | None, shape: tuple[int, int],
-        errors: Mapping[str, ImageError], left_out: bool,
+        self, name: str, address: str, detection: Detection | None, shape: tuple[int, int],
+        errors: Mapping[str, ImageError], excluded: bool,
     ) -> None:  # fmt: skip
-        with ui.element("div").classes("target left-out" if left_out else "target") as cell:
-            notice = _text(errors.get(name)) or (", not used" if errors and outcome is not None else "")
-            lines = "no target found" if outcome is None else f"{len(outcome.points)} points found"
+        with ui.element("div").classes("target left-out" if excluded else "target") as cell:
+            error = _error_html(errors.get(name)) or (", not used" if errors and detection is not None else "")
+            count = "no target found" if detection is None else f"{len(detection.points)} points found"
             with ui.element("figure"):
                 ui.html(
-                    f'<span class=shot><img src="{address}" alt="{escape(f"{name}, {lines}")}">'
-                    f"{_marks(outcome, shape)}</span><figcaption><b>{escape(name)}</b><br>{lines}{notice}"
+                    f'<span class=shot><img src="{address}" alt="{escape(f"{name}, {count}")}">'
+                    f"{_marks(detection, shape)}</span><figcaption><b>{escape(name)}</b><br>{count}{error}"
                     "</figcaption>", sanitize=False,
                 )  # fmt: skip
-            if outcome is None:
+            if detection is None:
                 return
-            out = [left_out]
+            state = [excluded]
             button = ui.button().props("outline no-caps dense")
 
-            def say() -> None:
-                text = "Take it again" if out[0] else "Leave it out"
+            def update() -> None:
+                text = "Include" if state[0] else "Exclude"
                 button.set_text(text)
                 button.props["aria-label"] = f"{text}: {name}"
-                button.props["aria-pressed"] = "true" if out[0] else "false"
+                button.props["aria-pressed"] = "true" if state[0] else "false"
                 button.update()
-                cell.classes(replace="target left-out" if out[0] else "target")
+                cell.classes(replace="target left-out" if state[0] else "target")
 
             def toggle() -> None:
-                out[0] = not out[0]
-                say()
+                state[0] = not state[0]
+                update()
                 self._toggled(name)
 
             button.on_click(toggle)
-            say()
+            update()
 
 
 def _poses(view: View, source: str) -> list[str]:
     return pose_names(view.open(source))
 
 
-def _text(error: ImageError | None) -> str:
+def _error_html(error: ImageError | None) -> str:
     if error is None:
         return ""
     return f", rms <b>{error.rms:.3f} px</b>{'' if error.used else ', did not fit'}"
 
 
-def _marks(outcome: Detection | None, shape: tuple[int, int]) -> str:
-    """A circle around each point, that of the lowest number filled."""
-    if outcome is None:
+def _marks(detection: Detection | None, shape: tuple[int, int]) -> str:
+    """Circles at the detected points as SVG, the first one filled."""
+    if detection is None:
         return ""
     height, width = shape
     radius = 0.012 * max(shape)
-    first = int(outcome.ids.argmin())
+    first = int(detection.ids.argmin())
     circles = "".join(
         f"<circle{' class=first' if i == first else ''} cx={u + 0.5:.2f} cy={v + 0.5:.2f} r={radius:.2f} />"
-        for i, (u, v) in enumerate(outcome.pixels)
+        for i, (u, v) in enumerate(detection.pixels)
     )
     return f"<svg viewBox='0 0 {width} {height}' preserveAspectRatio=none aria-hidden=true>{circles}</svg>"

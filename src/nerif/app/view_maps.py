@@ -1,4 +1,4 @@
-"""The views of a measurement as maps with one scale of colours."""
+"""Maps of the views of a measurement with one colour scale."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from nerif.report.view_images import image_address
 __all__ = ["magnitude_address", "maps_html", "threshold_address"]
 
 PIXELS = 320  # along the longer edge of a map
-QUANTILE = 0.995  # of what is shown, within the colours
+QUANTILE = 0.995  # of the values, within the colour range
 
 
 def maps_html(measurement: Measurement) -> str:
-    """Return a row of maps for each view: what was measured, by component, its sigma, and where it is valid."""
+    """Return a row of maps for each view as HTML: components of the signal, sigma, valid pixels."""
     (observation, *_), parts = integrals_of(measurement), []
     usable = measurement.usable_for(observation)
     values = observation.values.where(usable[..., None], torch.tensor(float("nan")))
@@ -33,25 +33,25 @@ def maps_html(measurement: Measurement) -> str:
         height, width = camera.image_size
         step = -(-max(height, width) // PIXELS)
         part = i, slice(0, height, step), slice(0, width, step)
-        display = {
+        images = {
             name: image_address(values[part][..., c].numpy(), (least, most))
             for c, name in enumerate(observation.components)
         }
         if sigma is not None:
-            display["sigma"] = image_address(sigma[part].numpy(), (0.0, noisiest), "viridis")
-        display["valid"] = image_address(usable[part].numpy().astype(float), (0.0, 1.0), "gray")
+            images["sigma"] = image_address(sigma[part].numpy(), (0.0, noisiest), "viridis")
+        images["valid"] = image_address(usable[part].numpy().astype(float), (0.0, 1.0), "gray")
         share = float(usable[i, :height, :width].float().mean())
         figures = "".join(
             f'<figure><img src="{address}" alt="{escape(f"{name} of view {camera.name}", quote=True)}">'
             f"<figcaption>{escape(name)}</figcaption></figure>"
-            for name, address in display.items()
+            for name, address in images.items()
         )
         parts.append(f"<h3>{escape(camera.name)}, {share:.1%} valid</h3><div class=images>{figures}</div>")
     return "".join(parts)
 
 
 def magnitude_address(measurement: Measurement, view: int) -> str:
-    """Return |value| of a view as an image, px for px where it is small."""
+    """Return the magnitude of the signal of a view as an image."""
     (observation, *_), camera = integrals_of(measurement), measurement.cameras[view]
     height, width = camera.image_size
     step = -(-max(height, width) // (3 * PIXELS))
@@ -61,7 +61,7 @@ def magnitude_address(measurement: Measurement, view: int) -> str:
 
 
 def threshold_address(measurement: Measurement, view: int, settings: MaskSettings, sigma: float | None) -> str:
-    """Return the mask of a view by threshold as an image, white where the flow is."""
+    """Return the threshold mask of a view as an image, white where the flow is."""
     name = measurement.names[view]
     masked = with_flow_masks(measurement.select([name]), settings, sigma)
     assert masked.flow_mask is not None
@@ -70,7 +70,7 @@ def threshold_address(measurement: Measurement, view: int, settings: MaskSetting
 
 
 def _largest(values: torch.Tensor) -> float:
-    """The size that nearly all values have at most."""
-    available = values[values.isfinite()].flatten()
-    some = available[:: max(1, len(available) // 1_000_000)]
-    return float(some.quantile(QUANTILE)) or 1.0 if len(some) else 1.0
+    """The 99.5 % quantile of the finite values, 1 if it is 0 or there are none."""
+    finite = values[values.isfinite()].flatten()
+    sample = finite[:: max(1, len(finite) // 1_000_000)]
+    return float(sample.quantile(QUANTILE)) or 1.0 if len(sample) else 1.0

@@ -1,4 +1,4 @@
-"""What every page is given: the project, its runs, what was typed, and a way to work beside the page."""
+"""State that all pages share: project, runs, image files and drafts."""
 
 from __future__ import annotations
 
@@ -20,22 +20,11 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 NOT_WRITABLE = (errno.EACCES, errno.EPERM, errno.EROFS)
-READ_ONLY = "This folder may not be written to: everything can be looked at, and nothing kept or started."
-"""What is said of such a folder."""
+READ_ONLY = "This folder is read-only: files can be viewed, but nothing can be saved or started."
 
 
 class Workspace:
-    """One project, as all pages and tabs see it.
-
-    Parameters
-    ----------
-    project : Project
-
-    Raises
-    ------
-    InputError
-        If what the app writes into the folder would be outside of it, by a link.
-    """
+    """One project, shared by all pages and tabs; InputError if a link leads its files outside of the folder."""
 
     def __init__(self, project: Project) -> None:
         for name in (OWN, f"{OWN}/jobs"):
@@ -48,18 +37,18 @@ class Workspace:
         return self.project.folder / OWN / "drafts.json"
 
     def draft(self, page: str) -> dict[str, Any]:
-        """Return what was typed on a page and is not the default: kept over a reload, and over another start."""
+        """Return the entries of a page that differ from the defaults; they survive a reload and a restart."""
         if not self._drafts and self._file.is_file():
             try:
-                result = json.loads(self._file.read_text())
-            except ValueError:  # damaged: nothing but what was typed is lost
-                result = {}
-            memory = result if isinstance(result, dict) else {}
-            self._drafts = {name: values for name, values in memory.items() if isinstance(values, dict)}
+                entries = json.loads(self._file.read_text())
+            except ValueError:  # damaged: only drafts are lost
+                entries = {}
+            drafts = entries if isinstance(entries, dict) else {}
+            self._drafts = {name: values for name, values in drafts.items() if isinstance(values, dict)}
         return self._drafts.setdefault(page, {})
 
     def keep(self, page: str, values: dict[str, Any]) -> None:
-        """Keep what was typed on a page; a folder that may not be written to keeps it as long as the server runs."""
+        """Store the entries of a page; in a read-only folder, only until the server ends."""
         self.draft(page)
         self._drafts[page] = dict(values)
         try:
@@ -70,5 +59,5 @@ class Workspace:
                 raise
 
     async def beside(self, work: Callable[P, T], *arguments: P.args, **named: P.kwargs) -> T:
-        """Do blocking work in a thread, while pages go on answering; its InputError comes back as it is."""
+        """Run blocking work in a thread, so that pages stay responsive."""
         return await asyncio.to_thread(work, *arguments, **named)
