@@ -148,7 +148,7 @@ def test_a_port_that_is_taken_gives_the_next(capsys):
         first.listen()
         port = first.getsockname()[1]
         assert Address.of("127.0.0.1", port, None).port > port
-    assert f"port {port} is taken" in capsys.readouterr().out
+    assert f"port {port} is in use" in capsys.readouterr().out
 
 
 def test_a_folder_that_is_none_is_said_in_one_line(tmp_path, capsys):

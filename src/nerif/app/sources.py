@@ -64,7 +64,7 @@ class Still:
 
     def limits(self, quantity: str) -> Limits:
         """Return the colour range."""
-        return colour_range(shown(self.volume(quantity)))
+        return colour_range(plotted_values(self.volume(quantity)))
 
     def level(self, quantity: str) -> float:
         """Return the default level of the isosurface."""

@@ -71,7 +71,7 @@ class TargetImages:
                 name = f"{view.name}/{source}/{pose}"
                 try:
                     address = await self.work.beside(self.files.image, view, source, number, LARGEST, view.crop)
-                    detection = await self.work.beside(self.files.found, view, source, number, targets[source])
+                    detection = await self.work.beside(self.files.result, view, source, number, targets[source])
                     shape = await self.work.beside(self._shape, view, source)
                 except InputError as error:
                     with grid:

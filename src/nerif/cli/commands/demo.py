@@ -31,7 +31,7 @@ class Demo(Settings):
 
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("out/demo")
     """Directory to write."""
-    steps: Annotated[int, Ge(1)] = 800
+    steps: Annotated[int, Ge(1)] = 700
     """Training steps of each of three runs: the reconstruction and two bootstrap trials."""
     pixels: Annotated[int, Ge(8)] = 64
     """Pixels along an edge of each view (paper: 200)."""
