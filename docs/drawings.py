@@ -448,7 +448,7 @@ def images() -> Figure:
     references = References(torch.tensor(reference)[None].float(), [(size, size)])
     pixel = torch.tensor(np.stack([column, row], axis=-1)).reshape(-1, 2).float()
     view = torch.zeros(len(pixel), dtype=torch.int16)
-    moved = references.seen(view, pixel, torch.tensor(d).reshape(-1, 2).float()).reshape(size, size).numpy()
+    moved = references.flow_at(view, pixel, torch.tensor(d).reshape(-1, 2).float()).reshape(size, size).numpy()
     figure = Figure(figsize=(9.2, 2.6))
     FigureCanvasAgg(figure)
     shown = (("$R$", reference), ("$I$", flow), ("$R - I$", reference - flow), ("$R(p - d) - I$", moved - flow))

@@ -23,6 +23,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerif.analysis.prediction import predict_view
+from nerif.common.blocks import blocks
 from nerif.common.conventions import FACES, InputError
 from nerif.common.findings import Finding
 from nerif.data.measurement import Measurement, Observation, integrals_of, measurement_of
@@ -242,14 +243,12 @@ def binned(measurement: Measurement, max_pixels: int) -> Measurement:
         k[:2, 2] = (k[:2, 2] + 0.5) / scale - 0.5
         height, width = camera.image_size
         cameras.append(replace(camera, intrinsics=k, image_size=(height // down, width // across)))
-    rows, columns = (n // bins for n, bins in zip(measurement.shape[1:], (down, across), strict=True))
-    inside = (slice(0, rows * down), slice(0, columns * across))
     observation = measurement.observations[0]
     pixels = scale if observation.technique.in_pixels() else torch.ones(1)
     maps = []
     for values, usable in zip(observation.values, measurement.usable, strict=True):
-        good = usable[inside].reshape(rows, down, columns, across)
-        parts = torch.where(good[..., None], values[inside].reshape(rows, down, columns, across, -1), 0.0)
+        good = blocks(usable, down, across)
+        parts = torch.where(good[..., None], blocks(values, down, across), 0.0)
         count = good.sum(dim=(1, 3))[..., None]
         mean = parts.sum(dim=(1, 3)) / count.clamp_min(1) / pixels.to(values)
         mean = mean if observation.signed else mean.clamp_min(0)  # negative values are noise, and refused without sigma

@@ -17,6 +17,8 @@ from statistics import NormalDist
 import numpy as np
 from jaxtyping import Bool, Float
 
+from nerif.common.blocks import blocks
+
 __all__ = ["CAUSES", "Whiteness", "white_noise", "whiteness"]
 
 Map = Float[np.ndarray, "row column c"]
@@ -143,11 +145,7 @@ def _tested(residual: Map, predicted: Map | None, mask: Mask, edge: int) -> _Blo
 
 
 def _block_sums(values: Map, edge: int) -> Float[np.ndarray, "rows columns c"]:
-    """Sums over whole blocks."""
-    rows, columns, channels = values.shape
-    high, wide = rows // edge, columns // edge
-    blocks = values[: high * edge, : wide * edge].reshape(high, edge, wide, edge, channels)
-    return blocks.sum(axis=(1, 3))
+    return blocks(values, edge, edge).sum(axis=(1, 3))
 
 
 def _explained(z: Float[np.ndarray, "b c"], patterns: Float[np.ndarray, "b c pattern"]) -> float:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from nerif.common.blocks import blocks
 from nerif.common.conventions import unit_shown
 from nerif.data.measurement import Measurement, Observation
 from nerif.data.reprojection import Reprojection
@@ -126,8 +127,7 @@ def _scale(reprojection: Reprojection, observation: Observation) -> Scale:
 
 def _shrink(image: Float[np.ndarray, "row column"], step: tuple[int, int]) -> Float[np.ndarray, "r c"]:
     """Means of whole blocks of pixels, NaN where any is NaN."""
-    (down, across), (height, width) = step, (n - n % s for n, s in zip(image.shape, step, strict=True))
-    return image[:height, :width].reshape(height // down, down, width // across, across).mean(axis=(1, 3))
+    return blocks(image, *step).mean(axis=(1, 3))
 
 
 def image_address(image: Float[np.ndarray, "row column"], limits: tuple[float, float], colours: str = "") -> str:

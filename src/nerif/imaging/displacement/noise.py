@@ -13,7 +13,7 @@ Grey = Shaped[np.ndarray, "row column"]
 FLOOR = 1e-3  # px, lower limit of the error of an optical flow
 
 
-def structure_variance(flow: Grey, moved: Grey, reach: float) -> Float[np.ndarray, "row column 2"]:
+def structure_variance(flow: Grey, prediction: Grey, reach: float) -> Float[np.ndarray, "row column 2"]:
     """Return the variance (px^2) of the shift between the flow image and the reference warped by it.
 
     cov = <r^2> (sum grad(I) grad(I)^T)^-1 with r the residual, over Gaussian windows of standard deviation `reach`.
@@ -21,9 +21,9 @@ def structure_variance(flow: Grey, moved: Grey, reach: float) -> Float[np.ndarra
     from scipy.ndimage import gaussian_filter
 
     pixels = 4 * np.pi * reach**2  # effective number in a Gaussian window
-    gv, gu = np.gradient(moved.astype(np.float64))
+    gv, gu = np.gradient(prediction.astype(np.float64))
     uu, vv, uv = (gaussian_filter(g, reach) * pixels for g in (gu * gu, gv * gv, gu * gv))
-    residual = gaussian_filter((as_float(flow) - as_float(moved)).astype(np.float64) ** 2, max(4.0, 2 * reach))
+    residual = gaussian_filter((as_float(flow) - as_float(prediction)).astype(np.float64) ** 2, max(4.0, 2 * reach))
     determinant = np.maximum(uu * vv - uv**2, 1e-9 * (uu + vv) ** 2 + 1e-12)
     return np.stack([residual * vv / determinant, residual * uu / determinant], axis=-1)
 

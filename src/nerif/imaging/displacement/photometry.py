@@ -127,21 +127,21 @@ class ImagePair:
         valid : pixels with a valid d
         """
         reference, flow = as_float(reference), as_float(flow)
-        moved, good = warp(reference, -d), valid & usable if bool((valid & usable).any()) else usable
-        gain, offset = np.polyfit(moved[good], flow[good], 1)
-        residual = flow - (gain * moved + offset)
+        prediction, good = warp(reference, -d), valid & usable if bool((valid & usable).any()) else usable
+        gain, offset = np.polyfit(prediction[good], flow[good], 1)
+        residual = flow - (gain * prediction + offset)
         noise = noise or CameraNoise.of_residual(flow, flow - residual, good)
         variance = difference_variance(flow, reference, noise.read, noise.shot, gain, repeats)
-        variance += _interpolation_variance(gain * moved, residual, d, variance, good)
+        variance += _interpolation_variance(gain * prediction, residual, d, variance, good)
         flow = np.where(usable, flow, np.nan)
         return cls(reference.astype(np.float32), flow.astype(np.float32), np.sqrt(variance).astype(np.float32))
 
 
 def _interpolation_variance(
-    moved: Image, residual: Image, d: Float[np.ndarray, "row column 2"], variance: Image, good: PixelMask
+    prediction: Image, residual: Image, d: Float[np.ndarray, "row column 2"], variance: Image, good: PixelMask
 ) -> Image:
     """Variance of the residual caused by interpolation between the pixels of the reference."""
-    steep = np.square(np.gradient(moved.astype(np.float64))).sum(axis=0)
+    steep = np.square(np.gradient(prediction.astype(np.float64))).sum(axis=0)
     share = local_mean(np.square(d - np.round(d)).sum(axis=-1) * steep)
     squares, shares = residual[good].astype(np.float64) ** 2, share[good]
     small = squares <= np.quantile(squares, TRIMMED)

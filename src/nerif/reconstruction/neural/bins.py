@@ -17,6 +17,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from nerif.common.blocks import blocks
 from nerif.data.measurement import Measurement, Observation
 from nerif.geometry import Box, Camera, Rays
 
@@ -90,9 +91,9 @@ def patches(
 
 def _sums(x: Float[Tensor, "row column k"], edge: int) -> Float[Tensor, "r c k"]:
     """Sums over bins; bins at the lower and right rim have fewer pixels."""
-    height, width, k = x.shape
+    height, width, _ = x.shape
     x = torch.nn.functional.pad(x.double(), (0, 0, 0, -width % edge, 0, -height % edge))
-    return x.reshape(x.shape[0] // edge, edge, -1, edge, k).sum(dim=(1, 3))
+    return blocks(x, edge, edge).sum(dim=(1, 3))
 
 
 def _inside(camera: Camera, box: Box, edge: int, open_faces: tuple[str, ...]) -> Bool[Tensor, "r c"]:
