@@ -108,7 +108,8 @@ def test_a_camera_from_a_ruler(browser, server, folder):
     for name, value in (("distance", "900"), ("mm_per_px", "0.5"), ("background_distance", "400")):
         put(browser, name, value)
     browser.find_element("css selector", ".more .q-item").click()
-    wait_for(browser, "return document.querySelector('input[name=views]') !== null")
+    wait_for(browser, "return document.querySelector('input[name=views]')?.checkVisibility() && "
+                      "document.getAnimations().length === 0")  # fmt: skip
     put(browser, "views", "cam2")
     wait_for(browser, "return document.querySelector('.command code').textContent.includes('--views cam2')")
     browser.find_element("xpath", "//button[contains(., 'Calibrate')]").click()

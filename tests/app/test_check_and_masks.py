@@ -60,7 +60,7 @@ def test_a_mirrored_view_is_found_and_undone(browser, server, folder):
     click(browser, "Compare the views")
     wait_for(browser, "return document.querySelector('.tabled table') !== null", 120)
     assert "the image is mirrored left to right" in text(browser, ".tabled table")
-    click(browser, "Undo what was found")
+    click(browser, "Correct the mistakes")
     found, good = written(folder / "bad.corrected.nc", 120), Measurement.read(folder / "good.nc")
     torch.testing.assert_close(found.displacement, good.displacement)
     click(browser, "Go on with bad.corrected.nc")

@@ -110,7 +110,7 @@ def images(driver: Any) -> None:
     """All images can be used."""
     go(driver, "Images")
     wait_for(driver, "return document.querySelectorAll('.view .pair img').length === 8")
-    wait_for(driver, "return document.querySelector('.status').textContent.startsWith('4 views. Nothing is wrong')")
+    wait_for(driver, "return document.querySelector('.status').textContent.startsWith('4 views. No problems found')")
 
 
 def calibration(driver: Any, target: dict[str, Any]) -> None:
@@ -125,7 +125,8 @@ def calibration(driver: Any, target: dict[str, Any]) -> None:
     more = driver.find_element("css selector", ".more .q-item")
     driver.execute_script("arguments[0].scrollIntoView({block: 'center'})", more)
     more.click()
-    wait_for(driver, "return document.querySelector('input[name=axes]') !== null")
+    wait_for(driver, "return document.querySelector('input[name=axes]')?.checkVisibility() && "
+                     "document.getAnimations().length === 0")  # fmt: skip
     fill(driver, "axes", " ".join(target["axes"]))
     wait_for(driver, "return document.querySelectorAll('.target circle').length > 50")
     click(driver, "Calibrate")
@@ -160,7 +161,7 @@ def check(driver: Any) -> None:
     wait_for(driver, f"return {lines}.some(line => line.endsWith('--voxels 8'))")
     click(driver, "Compare the views")
     wait_for(driver, "return document.querySelectorAll('.tabled tbody tr').length === 4", 90)
-    assert "Nothing odd found" in text(driver, 'section[aria-label="What was found"]')
+    assert "No problems found" in text(driver, 'section[aria-label="Findings"]')
     driver.find_element("xpath", "//main//a[contains(., 'Go on to Reconstruct')]").click()
 
 
