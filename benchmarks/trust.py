@@ -89,12 +89,14 @@ def measure(
     )
     flow = truth.abs() > FLOW * truth.abs().max()
     local = np.sqrt(gaussian_filter(error.double().numpy() ** 2, AVERAGED * voxels))[flow.numpy()]
-    coverage = metrics["coverage"]
+    coverage, uncertainty = metrics.coverage, metrics.uncertainty
+    assert coverage
+    assert uncertainty
     return {
-        "l2_variation": scores["l2_variation"], "one": coverage["share_in_one_in_flow"],
-        "two": coverage["share_in_flow"], "spearman": coverage["spearman"], "averaged": float(spearmanr(local,
+        "l2_variation": scores["l2_variation"], "one": coverage["one_sigma_in_flow"],
+        "two": coverage["two_sigma_in_flow"], "spearman": coverage["spearman"], "averaged": float(spearmanr(local,
         std[flow].numpy()).statistic), "ratio": float(std[flow].norm() / error[flow].norm()),
-        "cost": seconds / (seconds - metrics["uncertainty"]["seconds"]),
+        "cost": seconds / (seconds - uncertainty["seconds"]),
     }  # fmt: skip
 
 

@@ -10,13 +10,14 @@ from __future__ import annotations
 import statistics
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from benchmarks.measurements import FAULTS, RIGS, random_case
 from benchmarks.runner import Settings, table
 from nerif.analysis.evaluation import evaluate
-from nerif.analysis.verdict import WORDS, Verdict, verdict
+from nerif.analysis.verdict import RATINGS, Verdict, verdict
 from nerif.data.volume import Volume
 from nerif.data.volume_file import write_netcdf
 from nerif.geometry import Grid
@@ -24,6 +25,7 @@ from nerif.reconstruction.base import Reconstructor
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.voxels.total_variation import TotalVariation
 from nerif.results.directory import Result, ResultDirectory
+from nerif.results.metrics import Metrics
 from nerif.workflow.pipeline import Run, reconstruct_into
 
 BAD, GOOD = 0.05, 0.02  # of the variation
@@ -55,11 +57,11 @@ def measure(folder: Path, number: int, method: str, steps: int, pixels: int, vox
         write_netcdf(truth, [volume])
         error = evaluate(out, truth=truth)["l2_variation"]
     labels = {name: getattr(case, name) for name in ("fault", "phantom", "views", "noise", "rig")}
-    return {**labels, "error": error, "metrics": metrics}
+    return {**labels, "error": error, "metrics": asdict(metrics)}
 
 
 def judge(row: Row) -> Verdict:
-    return verdict(Result(Path(), settings={"method": row["method"]}, metrics=row["metrics"]))
+    return verdict(Result(Path(), settings={"method": row["method"]}, metrics=Metrics.of(row["metrics"])))
 
 
 def blocks(rows: list[Row]) -> list[str]:
@@ -70,20 +72,20 @@ def blocks(rows: list[Row]) -> list[str]:
     cells = []
     for name, group in groups:
         if group:
-            errors, words = [row["error"] for row, _ in group], [v.word for _, v in group]
+            errors, words = [row["error"] for row, _ in group], [v.rating for _, v in group]
             median = f"{statistics.median(errors):.1%}"
-            counts = (str(words.count(word)) for word in WORDS)
+            counts = (str(words.count(word)) for word in RATINGS)
             cells.append([name, str(len(group)), median, f"{max(errors):.1%}", *counts, close(group)])
 
     def share(word: str, among: Callable[[float], bool]) -> str:
-        words = [v.word for row, v in judged if among(row["error"])]
+        words = [v.rating for row, v in judged if among(row["error"])]
         ratio = f"{words.count(word) / max(len(words), 1):.1%}"
         return f'"{word}" in {words.count(word)} of {len(words)} ({ratio}; goal: below {GOAL:.0%})'
 
-    columns = ("fault", "cases", "median error", "largest", *WORDS, f"within a factor of {FACTOR:g}")
+    columns = ("fault", "cases", "median error", "largest", *RATINGS, f"within a factor of {FACTOR:g}")
     notes = [
-        f"Error above {BAD:.0%}: {share(WORDS[0], lambda e: e > BAD)}.",
-        f"Error below {GOOD:.0%}: {share(WORDS[2], lambda e: e < GOOD)}.",
+        f"Error above {BAD:.0%}: {share(RATINGS[0], lambda e: e > BAD)}.",
+        f"Error below {GOOD:.0%}: {share(RATINGS[2], lambda e: e < GOOD)}.",
         f"Estimates within a factor of {FACTOR:g} of the error: {close(judged)} (goal: {NINE_IN_TEN:.0%}).",
     ]
     ratios = sorted(v.error / row["error"] for row, v in judged if v.error is not None)

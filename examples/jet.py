@@ -109,7 +109,7 @@ def cells(out: Path, measurement: Measurement, shortest: float, longest: float) 
         estimate = spacing(meridian.h, meridian.quantities["index_excess"][:, 0], shortest, longest)
         print(f"shock cells by the field from {name}: {estimate.length:.2f} +- {estimate.sigma:.2f} mm "
               f"({estimate.explained:.0%} of what varies on the axis)")  # fmt: skip
-    axis, camera = ResultDirectory(out / "displacements").metrics()["axis"]["symmetry"], measurement.cameras[0]
+    axis, camera = ResultDirectory(out / "displacements").metrics().axis["symmetry"], measurement.cameras[0]
     h = np.linspace(measurement.box.lower[2], measurement.box.upper[2], camera.image_size[0])
     points = torch.tensor(axis["point"]) + torch.from_numpy(h)[:, None] * torch.tensor(axis["frame"][2])
     column, row = camera.project(points.to(camera.intrinsics)).round().long().unbind(-1)

@@ -18,6 +18,7 @@ from nerif.forward.deflection import MODELS
 from nerif.forward.path_integral import PathIntegral, project
 from nerif.geometry import Grid
 from nerif.results.directory import METRICS, ResultDirectory
+from refusals import refused
 
 
 def test_the_residual_of_the_true_field_is_the_noise(measurement, ball):
@@ -39,17 +40,31 @@ def test_a_field_ten_per_cent_too_strong(measurement, ball):
 
 def test_metrics_are_plain_json_and_accumulate(tmp_path):
     directory = ResultDirectory(tmp_path)
-    directory.add_metrics({"a": 1.5, "bad": math.nan, "views": [{"x": math.inf, "y": (1, 2)}]})
-    directory.add_metrics({"b": "text"})
-    expected = {"a": 1.5, "bad": None, "views": [{"x": None, "y": [1, 2]}], "b": "text"}
+    directory.add_metrics(slices=[{"z_mm": 1.0, "cc": 0.5, "ssim": math.nan, "psnr": math.inf}])
+    directory.add_metrics(device="cpu")
+    scores = {"z_mm": 1.0, "cc": 0.5, "ssim": None, "psnr": None}
+    expected = {"version": 1, "device": "cpu", "slices": [scores]}
     assert json.loads((tmp_path / METRICS).read_text()) == expected
+    metrics = directory.metrics()
+    assert math.isnan(metrics.slices[0]["ssim"])
+    assert metrics.l2 is None
+
+
+@pytest.mark.parametrize(
+    ("entries", "field"),
+    [({"views": []}, "version"), ({"version": 1, "cc": "high"}, "cc"), ({"version": 1, "clarity": 2}, "clarity")],
+)
+def test_metrics_of_another_form_are_refused(tmp_path, entries, field):
+    (tmp_path / METRICS).write_text(json.dumps(entries))
+    with refused(field):
+        ResultDirectory(tmp_path).metrics()
 
 
 def test_scores_of_a_view_without_valid_pixels_are_nan(measurement, ball):
     valid = torch.ones(measurement.displacement.shape[:3], dtype=torch.bool)
     valid[0] = ~measurement.sees_box[0]
     views = evaluate_views(reproject(ball, replace(measurement, valid=valid)))
-    assert math.isnan(views[0]["rms_px"])
+    assert math.isnan(views[0]["rms"])
     assert views[1]["cc"] > 0.99
 
 

@@ -27,6 +27,7 @@ from nerif.fields.phantoms import Flame
 from nerif.geometry import Box, Grid
 from nerif.reconstruction.base import Outcome, Reconstruction
 from nerif.results.directory import ResultDirectory
+from nerif.results.metrics import Metrics
 from refusals import refused
 from report.browsing import errors, needs_browser, requests, text, wait_for
 
@@ -51,9 +52,10 @@ def result(path: Path, voxels: int, error: float) -> None:
     found.write_volumes([index, spread])
     views = [
         {"name": str(i), "withheld": i == 0, "measured": "displacement", "unit": "px", "cc": 0.99, "rms": 0.01,
-         "rms_predicted": 0.5} for i in range(5)
+         "ssim": 0.99, "psnr": 40.0, "pixels": 100, "rms_predicted": 0.5, "rms_measured": 0.5} for i in range(5)
     ]  # fmt: skip
-    found.write_metrics({"views": views, "outcome": "converged", "seconds": 12.0, "uncertainty": {"members": 4}})
+    trials = {"kind": "fast", "trials": 2, "diverged_trials": [], "seconds": 4.0}
+    found.write_metrics(Metrics(views=views, outcome="converged", seconds=12.0, uncertainty=trials))
     (path / "report.html").write_text(REPORT)
 
 
@@ -73,7 +75,7 @@ def test_what_is_listed_and_what_is_said_of_it(folder):
     project = Project(folder)
     first, second, film = rows_of(project, project.contents())
     assert (first.name, second.name, film.name) == ("results/a <b>", "results/other", "film.zarr")
-    assert first.cells[:5] == ("Tikhonov", "use", "2.0% of the variation", "0.01 px", "converged")
+    assert first.cells[:5] == ("Tikhonov", "use", "1.9% of the variation", "0.01 px", "converged")
     assert dict(film.figures)["Frames"] == "3 of 3"
     unfinished = folder / "results" / "z"
     ResultDirectory(unfinished).begin({"method": "nerif"})

@@ -69,7 +69,7 @@ def test_result_directory_is_complete(work):
     assert metrics["seconds"] > 0
     assert metrics["peak_memory_bytes"] > 1e6
     assert [v["withheld"] for v in metrics["views"]] == [False, False, False, True]
-    assert set(metrics["views"][0]) >= {"name", "withheld", "cc", "ssim", "psnr", "rms_px"}
+    assert set(metrics["views"][0]) >= {"name", "withheld", "cc", "ssim", "psnr", "rms"}
     volume = xr.load_dataset(work / "r/volume.nc", engine="h5netcdf")
     assert set(volume.data_vars) == {"index_excess", "n", "density", "temperature"}
     assert volume["n"].dtype == np.float64
@@ -117,10 +117,10 @@ def test_views_are_compared_by_the_model_of_the_reconstruction(work, tmp_path):
     assert run("reconstruct", path, "-o", out, "--model", "paraxial", *QUICK) == 0
     measurement, field = Measurement.read(path), read_field(out)[0]
     by_model = {model: evaluate_views(reproject(field, measurement, model=model)) for model in MODELS}
-    scores = {model: [v["rms_px"] for v in views] for model, views in by_model.items()}
+    scores = {model: [v["rms"] for v in views] for model, views in by_model.items()}
     assert scores["paraxial"] != pytest.approx(scores["lever_arm"], rel=1e-4)
     for _ in range(2):
-        assert [v["rms_px"] for v in metrics_of(out)["views"]] == pytest.approx(scores["paraxial"], rel=1e-5)
+        assert [v["rms"] for v in metrics_of(out)["views"]] == pytest.approx(scores["paraxial"], rel=1e-5)
         assert run("evaluate", out, "--measurement", path) == 0
 
 

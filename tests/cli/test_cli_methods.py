@@ -95,7 +95,7 @@ def test_networks_and_voxels_start_from_each_other(work, tmp_path):
     losses = [float(r["fit_loss"]) for r in history_of(warm) if r["fit_loss"]]
     assert losses[-1] < 0.7 * losses[0]
     assert run("reconstruct", m, "-o", cold, *small) == 0
-    rms = [max(v["rms_px"] for v in metrics_of(d)["views"]) for d in (warm, cold)]
+    rms = [max(v["rms"] for v in metrics_of(d)["views"]) for d in (warm, cold)]
     assert rms[0] < rms[1]
     words = str.split("--method tikhonov --voxels 14 --iterations 2 --device cpu --no-report")
     assert run("reconstruct", m, "-o", tmp_path / "t", "--start-from", warm, *words) == 0

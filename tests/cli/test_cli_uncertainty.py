@@ -73,9 +73,9 @@ def test_standard_deviations_and_percentiles_are_written(result):
     assert "index_excess_certainty" in read_volumes(out / "volume.vti")  # an opacity for ParaView
     metrics = metrics_of(out)
     entries = metrics["uncertainty"]
-    assert (entries["kind"], entries["members"], entries["diverged"]) == ("fast", 2, [])
+    assert (entries["kind"], entries["trials"], entries["diverged_trials"]) == ("fast", 2, [])
     assert len(metrics["cross_validation"]["views"]) == 1
-    assert "standard deviations" in metrics["verdict"]["why"]
+    assert "standard deviations" in metrics["verdict"]["reasons"]
 
 
 def test_slices_are_hatched_where_the_standard_deviation_is_large(result):
@@ -89,7 +89,7 @@ def test_slices_are_hatched_where_the_standard_deviation_is_large(result):
 def test_coverage_is_evaluated_and_reported(result, tmp_path):
     out, lines = result
     coverage = metrics_of(out)["coverage"]
-    assert 0 <= coverage["share_in_one_in_flow"] <= coverage["share_in_flow"] <= 1
+    assert 0 <= coverage["one_sigma_in_flow"] <= coverage["two_sigma_in_flow"] <= 1
     assert coverage["reliability"] == sorted(coverage["reliability"])
     assert "truth within 2 standard deviations" in lines
     assert run("report", out) == 0
@@ -105,7 +105,7 @@ def test_coverage_is_evaluated_and_reported(result, tmp_path):
     shift[:, :, ::2] = 3.0  # standard deviations
     write_netcdf(tmp_path / "t.nc", [Volume(field + shift * std, half, attributes={"n_ambient": 1.00027})])
     assert run("evaluate", out, "--truth", tmp_path / "t.nc") == 0
-    assert metrics_of(out)["coverage"]["share"] == pytest.approx(0.5, abs=0.02)
+    assert metrics_of(out)["coverage"]["two_sigma"] == pytest.approx(0.5, abs=0.02)
 
 
 @pytest.mark.slow
@@ -148,7 +148,7 @@ def test_diverged_runs(path, tmp_path, capsys, monkeypatch, diverged):
     if diverged == "trial":
         assert "trial 2 diverged" in lines
         entries = metrics_of(out)["uncertainty"]
-        assert (entries["members"], entries["diverged"]) == (1, [2])
+        assert (entries["trials"], entries["diverged_trials"]) == (1, [2])
         assert "trials 2 diverged" in (out / "report.html").read_text()
     else:
         assert len(calls) == 1

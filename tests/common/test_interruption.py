@@ -87,7 +87,7 @@ def test_a_reconstruction_reports_what_is_saved_and_continues(stage, measurement
     if not first:
         assert f"nerif reconstruct --resume --out {out}" in str(stop.value)
         assert main(["reconstruct", "--resume", "--out", str(out)]) == 0
-        assert ResultDirectory(out).metrics()["verdict"]
+        assert ResultDirectory(out).metrics().verdict
 
 
 def test_a_second_ctrl_c_in_the_training_leads_to_the_checkpoint(measurement, tmp_path):

@@ -17,6 +17,7 @@ from nerif.data.volume_sequence import FIELDS
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Ring
 from nerif.results.directory import CALIBRATION, FIGURES, METRICS, REPORT, RUN, ResultDirectory
+from nerif.results.metrics import Metrics
 from nerif.simulation.experiment import Experiment
 from refusals import refused
 from sequence_films import QUICK, simulated
@@ -46,7 +47,7 @@ def result(tmp_path, lines) -> ResultDirectory:
     """The directory of a run with trials and figures."""
     result = ResultDirectory(tmp_path / "r", lines.append)
     result.begin({"seed": 1})
-    result.write_metrics({"seconds": 1})
+    result.write_metrics(Metrics(seconds=1))
     write_own(result.path, REPORT, CALIBRATION)
     for folder in (result.member(1).path, result.member(2).path, result.cross_validation.path):
         write_own(folder, "views.json", "field.safetensors")

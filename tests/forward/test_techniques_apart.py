@@ -95,9 +95,9 @@ def test_gains_are_part_of_the_result(files, tmp_path):
     reconstruct_into(out.path, uneven, QUICK, Run(fit_gains=True, report=False))
     about = tomllib.loads((out / "run.toml").read_text())["about"]
     assert about["gains"] == pytest.approx(fit_gains(Measurement.read(uneven)), rel=1e-6)
-    before, views = out.metrics()["views"], out.reprojection()
+    before, views = out.metrics().views, out.reprojection()
     evaluate(out.path, measurement=uneven)
-    after = out.metrics()["views"]
+    after = out.metrics().views
     assert [v["rms"] for v in after] == pytest.approx([v["rms"] for v in before], rel=1e-5)
     torch.testing.assert_close(out.reprojection().measurement.maps["radiance"], views.measurement.maps["radiance"])
     settings = {k: v for k, v in out.settings().items() if k != "about"}
@@ -106,7 +106,7 @@ def test_gains_are_part_of_the_result(files, tmp_path):
         evaluate(out.path, measurement=uneven)
     out.write_settings(settings)  # without them the views are not those that were fitted
     evaluate(out.path, measurement=uneven)
-    assert out.metrics()["views"][0]["rms"] > 1.5 * before[0]["rms"]
+    assert out.metrics().views[0]["rms"] > 1.5 * before[0]["rms"]
 
 
 @pytest.mark.parametrize("left", [0.0, 1e-3])

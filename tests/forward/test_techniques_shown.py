@@ -153,14 +153,6 @@ def test_notebooks_show_each_technique(both, absorption):
     assert "mm⁻¹" in read_volume(absorption / "volume.nc")._repr_html_()
 
 
-def test_metrics_of_displacements_alone_are_still_read(absorption, tmp_path):
-    """As written by versions without other techniques."""
-    metrics = {"views": [{"name": "0deg", "withheld": False, "cc": 0.9, "rms_px": 0.25}]}
-    (tmp_path / "metrics.json").write_text(json.dumps(metrics))
-    [view] = ResultDirectory(tmp_path).metrics()["views"]
-    assert (view["measured"], view["unit"], view["rms"]) == ("displacement", "px", 0.25)
-
-
 def test_mistakes_considered_are_those_that_a_technique_can_have(both, absorption):
     combined, alone = (Measurement.read(p.with_suffix(".nc")) for p in (both, absorption))
     pairs = [(o, m.cameras) for m in (combined, alone) for o in m.observations]

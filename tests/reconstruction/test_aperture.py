@@ -236,7 +236,7 @@ def test_lenses_on_the_command_line(wide, tmp_path, capsys):
     field, _, _ = ResultDirectory(out).field()
     seen = {name: reproject(field, apply_aperture(wide, name)) for name in ("auto", "off")}
     scores = {name: evaluate_views(reprojection)[0]["rms"] for name, reprojection in seen.items()}
-    assert ResultDirectory(out).metrics()["views"][0]["rms"] == pytest.approx(scores["off"], rel=1e-4)
+    assert ResultDirectory(out).metrics().views[0]["rms"] == pytest.approx(scores["off"], rel=1e-4)
     assert scores["auto"] != pytest.approx(scores["off"], rel=1e-3)
     assert main(["project", str(out), "-o", str(tmp_path / "p.nc"), "--cameras", str(path), "--f-number", "8"]) == 2
     assert main(["project", str(out), "-o", str(tmp_path / "p.nc"), "--aperture", "off"]) == 2

@@ -244,7 +244,7 @@ def test_sigma_weights_the_rays(measurement):
     wrong, rms = replace(measurement, displacement=displacement, sigma=sigma), []
     for m in (wrong, replace(wrong, sigma=None)):
         views = evaluate_views(reproject(replace(SMALL, max_steps=60)(m).field, measurement))
-        rms.append(max(views[i]["rms_px"] for i in (0, 1, 3, 4)))
+        rms.append(max(views[i]["rms"] for i in (0, 1, 3, 4)))
     assert rms[0] < 0.5 * rms[1]
 
 

@@ -82,14 +82,14 @@ def posterior(measurement: Measurement, field: Field, **settings) -> list[dict]:
 def test_posterior_deviations_are_smaller_than_the_prior_and_grow_with_the_noise(measured):
     rows = posterior(measured, BALLS)
     for row in rows:
-        assert row["constrained"] > UNCONSTRAINED
+        assert row["uncertainty_reduction"] > UNCONSTRAINED
         assert row["rms_after"] == pytest.approx(1, abs=0.15)
-        assert all(0 < row["sigma_after"][name] <= 1.001 * row["sigma"][name] for name in row["values"])
+        assert all(0 < row["posterior_sigma"][name] <= 1.001 * row["prior_sigma"][name] for name in row["values"])
     rig = Refinement.of_table(measured, SETTINGS, ())
     prior_px = float((rig.aside(0) * rig.sigma[0, rig.columns]).norm(dim=1).max())
-    assert max(row["aside_sigma_px"] for row in rows) < 0.6 * prior_px
+    assert max(row["image_shift_sigma_px"] for row in rows) < 0.6 * prior_px
     noisier = posterior(replace(measured, sigma=3 * measured.sigma), BALLS)
-    assert noisier[0]["aside_sigma_px"] > 1.2 * rows[0]["aside_sigma_px"]
+    assert noisier[0]["image_shift_sigma_px"] > 1.2 * rows[0]["image_shift_sigma_px"]
 
 
 def test_the_shift_of_the_middle_is_linear_in_the_parameters(measured):
@@ -97,7 +97,7 @@ def test_the_shift_of_the_middle_is_linear_in_the_parameters(measured):
     rig.values = 0.1 * torch.randn(rig.sigma.shape, generator=torch.Generator().manual_seed(0)).double() * rig.sigma
     for v, row in enumerate(rig.table()):
         expected = float((rig.aside(v) @ rig.values[v, rig.columns]).norm())
-        assert row["aside_px"] == pytest.approx(expected, rel=0.02)
+        assert row["image_shift_px"] == pytest.approx(expected, rel=0.02)
 
 
 @pytest.mark.parametrize("case", ["noise above the signal", pytest.param("column", marks=pytest.mark.slow)])
@@ -108,7 +108,7 @@ def test_unconstrained_poses_are_reported(measured, case):
         sigma = 300 * measured.sigma
         noise = sigma * torch.randn(sigma.shape, generator=torch.Generator().manual_seed(1))
         rows = posterior(replace(measured, displacement=measured.displacement + noise, sigma=sigma), BALLS)
-    assert max(row["constrained"] for row in rows) < UNCONSTRAINED
+    assert max(row["uncertainty_reduction"] for row in rows) < UNCONSTRAINED
     assert "do not constrain the pose of any view" in refinement_lines(rows)[1]
 
 
@@ -120,7 +120,7 @@ def test_corrections_of_three_views_are_reported_as_uncertain():
 def test_a_withheld_view_is_refined_against_the_field(measured):
     view = knocked(measured).select([measured.names[2]])
     (row,) = refit(BALLS, view, {**SETTINGS, "pose_sigma_mm": 2.0})
-    assert row["aside_px"] > 1.2
+    assert row["image_shift_px"] > 1.2
     assert error_px(with_corrections(view, [row]), measured, 0) < 0.2
 
 
@@ -129,7 +129,7 @@ def test_voxels_refine_a_rig(measured, method):
     wrong = knocked(measured)
     settings = method(voxels=20, refine=("cameras",), pose_sigma_mm=2.0, coarse_to_fine=False, device="cpu")
     rows = settings(wrong).rig
-    assert max(rows, key=lambda row: row["aside_px"])["name"] == wrong.names[2]
+    assert max(rows, key=lambda row: row["image_shift_px"])["name"] == wrong.names[2]
     assert error_px(with_corrections(wrong, rows), measured) < 0.6 * error_px(wrong, measured)
 
 
@@ -152,7 +152,9 @@ def test_a_resumed_refinement_with_voxels_equals_a_complete_one(measured):
     assert half.outcome.reason == "interrupted"
     again = settings(measured, resume=half.state)
     for a, b in zip(whole.rig, again.rig, strict=True):  # except for the directions of conjugate gradients
-        assert max(abs(a["values"][name] - b["values"][name]) / sigma for name, sigma in a["sigma"].items()) < 0.05
+        assert (
+            max(abs(a["values"][name] - b["values"][name]) / sigma for name, sigma in a["prior_sigma"].items()) < 0.05
+        )
 
 
 @pytest.mark.slow
@@ -193,9 +195,11 @@ def test_a_result_has_the_posterior_and_the_withheld_view_with_both_cameras(meas
     words = ["reconstruct", str(tmp_path / "m.nc"), "-o", str(out), "--method", "tv", "--voxels", "16"]
     assert main([*words, "--refine", "cameras", "--withhold", withheld, "--device", "cpu"]) == 0
     metrics = json.loads((out / "metrics.json").read_text())
-    assert all({"constrained", "sigma_after", "rms_before", "rms_after"} <= set(row) for row in metrics["rig"])
+    assert all(
+        {"uncertainty_reduction", "posterior_sigma", "rms_before", "rms_after"} <= set(row) for row in metrics["rig"]
+    )
     (before,) = [view for view in metrics["views"] if view["withheld"]]
-    (after,) = metrics["views_refitted"]
+    (after,) = metrics["withheld_views"]
     assert after["name"] == withheld
     assert after["rms"] < before["rms"]
     page = (out / "report.html").read_text()

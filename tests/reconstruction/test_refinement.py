@@ -216,7 +216,7 @@ def test_a_resumed_run_equals_a_complete_one(wrong):
     assert [row["name"] for row in whole.rig] == list(wrong.names)
     for a, b in zip(whole.rig, again.rig, strict=True):
         assert list(a["values"].values()) == pytest.approx(list(b["values"].values()), rel=1e-6, abs=1e-12)
-    assert max(row["moved"] for row in whole.rig) > 0
+    assert max(row["correction_over_sigma"] for row in whole.rig) > 0
     plain = replace(settings, refine=(), max_steps=2)
     assert plain(wrong).rig == []
     for settings_, state in ((plain, half.state), (settings, plain(wrong).state)):
@@ -277,8 +277,20 @@ def test_priors_are_given_or_of_the_camera_or_the_default(measured, view, mm, si
 
 
 def test_significant_corrections_are_reported():
-    near = {"name": "a", "moved": 0.5, "values": {"shift_x": 0.1}, "sigma": {"shift_x": 0.2}}
-    far = {"name": "b", "moved": 5.0, "values": {"shift_x": 1.0}, "sigma": {"shift_x": 0.2}}
+    near = {
+        "name": "a",
+        "correction_over_sigma": 0.5,
+        "image_shift_px": 0.0,
+        "values": {"shift_x": 0.1},
+        "prior_sigma": {"shift_x": 0.2},
+    }
+    far = {
+        "name": "b",
+        "correction_over_sigma": 5.0,
+        "image_shift_px": 0.0,
+        "values": {"shift_x": 1.0},
+        "prior_sigma": {"shift_x": 0.2},
+    }
     first, line = refinement_lines([near, far, near, near])
     assert "b, 5.0 sigma" in first
     assert line.startswith("view b is not where its calibration says: shift_x 1 mm, 5.0 sigma")

@@ -114,7 +114,7 @@ def test_one_view_determines_the_axis_in_the_image_plane_only(jet, shift):
     assert abs(float(beside @ e1)) < 0.05
     assert abs(float(lean @ torch.linalg.cross(look, torch.tensor([0.0, 0.0, 1.0]).double()))) < 0.003
     assert one.constrained == (True, False, True, False)
-    assert one.sigma_after[1] == one.sigma[1]
+    assert one.posterior_sigma[1] == one.prior_sigma[1]
 
 
 @pytest.mark.slow

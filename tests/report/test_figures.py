@@ -111,8 +111,8 @@ def test_functions_return_the_axes_they_draw_into(volume, whole):
         (drawing.draw_slice, volume, "y"),
         (drawing.draw_map, np.zeros((3, 4)), (-1.0, 1.0)),
         (figures.draw_history, result.history, "nerif"),
-        (figures.draw_slice_scores, result.metrics["slices"]),
-        (figures.draw_view_scores, result.metrics["views"]),
+        (figures.draw_slice_scores, result.metrics.slices),
+        (figures.draw_view_scores, result.metrics.views),
         (figures.draw_residuals, residuals_over_sigma(result.reprojection)["displacement"]),
     ):
         axes = Figure().subplots()
@@ -254,10 +254,10 @@ def test_a_reliability_diagram_is_the_diagonal_for_correct_deviations():
     flow[::2] = False
     scores = coverage(std * rng.standard_normal(std.shape), std, flow)
     np.testing.assert_allclose(scores["reliability"], LEVELS, atol=0.02)
-    assert scores["share"] == pytest.approx(0.954, abs=0.005)
-    assert scores["share_in_one_in_flow"] == pytest.approx(0.683, abs=0.01)
+    assert scores["two_sigma"] == pytest.approx(0.954, abs=0.005)
+    assert scores["one_sigma_in_flow"] == pytest.approx(0.683, abs=0.01)
     assert 0.2 < scores["spearman"] < 0.6
     line = figures.draw_reliability(Figure().subplots(), scores).get_lines()[1]
     np.testing.assert_allclose(line.get_ydata(), scores["reliability"])
     underestimated = coverage(2 * std * rng.standard_normal(std.shape), std, flow)
-    assert underestimated["share_in_flow"] == pytest.approx(0.683, abs=0.02)
+    assert underestimated["two_sigma_in_flow"] == pytest.approx(0.683, abs=0.02)

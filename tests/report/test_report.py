@@ -22,6 +22,7 @@ from nerif.report.scene import scene_of
 from nerif.report.summary import LEVELS, Statement, statements
 from nerif.report.view_images import _shrink, lattice_step, view_images
 from nerif.results.directory import Result, ResultDirectory
+from nerif.results.metrics import Metrics
 from refusals import refused
 from report.page_reading import quantity_of, unpack
 
@@ -54,10 +55,10 @@ def test_the_page_is_complete_and_loads_nothing(whole):
     for phrase in (
         "Measurement", "Reconstruction", "Accuracy", "withheld", "170deg", "bootstrap of 2", "Against the truth",
         "Gladstone-Dale", "101325 Pa", "arXiv:2409.14722", f"CC {number(withheld['cc'], 5)}",
-        f"{number(withheld['rms_px'], 3)} px = {withheld['rms_over_sigma']:.2f} σ", f"L2 {metrics['l2']:.2%}",
+        f"{number(withheld['rms'], 3)} px = {withheld['rms_over_sigma']:.2f} σ", f"L2 {metrics['l2']:.2%}",
     ):  # fmt: skip
         assert phrase in text, phrase
-    assert 0 <= metrics["coverage"]["share"] <= 1
+    assert 0 <= metrics["coverage"]["two_sigma"] <= 1
 
 
 def test_packed_values_are_recovered():
@@ -189,7 +190,8 @@ def worst(found: list[Statement]) -> str:
 
 
 def view(withheld: bool, cc: float, noise: float | None, **more) -> dict:
-    row = {"name": "a", "withheld": withheld, "cc": cc, "rms": 0.1, "measured": "displacement", "unit": "px", **more}
+    row = {"name": "a", "withheld": withheld, "cc": cc, "rms": 0.1, "measured": "displacement", "unit": "px"}
+    row |= {"ssim": 0.9, "psnr": 40.0, "pixels": 100, "rms_predicted": 10.0, "rms_measured": 10.0, **more}
     return row if noise is None else {**row, "rms_over_sigma": noise}
 
 
@@ -224,7 +226,7 @@ FIT, GOOD = view(False, 0.99, 1.0), view(True, 0.99, 1.0)
     ],
 )
 def test_statements_on_views(tmp_path, views, level, phrase):
-    found = statements(Result(tmp_path, metrics={} if views is None else {"views": views}))
+    found = statements(Result(tmp_path, metrics=Metrics(views=views or [])))
     assert worst(found) == level
     assert any(s.level == level and phrase in s.text for s in found)
 
@@ -233,16 +235,15 @@ def test_statements_on_views(tmp_path, views, level, phrase):
     ("metrics", "level", "phrase"),
     [
         ({"cc": 0.5, "l2_variation": 0.9}, "bad", "90.0%"),
-        ({"uncertainty": {"members": 3, "diverged": [2]}}, "warning", "trials 2"),
+        ({"uncertainty": {"kind": "fast", "trials": 3, "diverged_trials": [2], "seconds": 1.0}}, "warning", "trials 2"),
         ({"outcome": "diverged", "message": "loss is NaN"}, "bad", "loss is NaN"),
         ({"outcome": "collapsed", "message": "no gradient"}, "bad", "collapsed to the ambient. no gradient"),
         ({"outcome": "interrupted"}, "warning", "--resume"),
-        ({"outcome": ["steps"]}, "good", "CC 0.99"),
         ({"outcome": "time_limit"}, "note", "time limit"),
     ],
 )
 def test_statements_on_the_run(tmp_path, metrics, level, phrase):
-    found = statements(Result(tmp_path, metrics={"views": [FIT, GOOD], **metrics}))
+    found = statements(Result(tmp_path, metrics=Metrics(views=[FIT, GOOD], **metrics)))
     assert worst(found) == level
     assert any(s.level == level and phrase in s.text for s in found)
 

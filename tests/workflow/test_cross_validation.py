@@ -35,10 +35,10 @@ def test_a_view_is_predicted_before_it_is_used(measurement, tmp_path, method):
     out, lines = ResultDirectory(tmp_path / "r"), []
     reconstruct_into(out.path, measurement, method, SILENT, monitor=Monitor(lines.append))
     result, name = out.read(), best_covered(measurement.cameras)[0]
-    (score,) = result.metrics["cross_validation"]["views"]
+    (score,) = result.metrics.cross_validation["views"]
     assert (score["name"], score["withheld"]) == (name, True)
     assert any(line.startswith(f"cross-validation: withheld view {name} predicted") for line in lines)
-    views = {v["name"]: v for v in result.metrics["views"]}
+    views = {v["name"]: v for v in result.metrics.views}
     assert set(views) == set(measurement.names)
     assert not any(v["withheld"] for v in views.values())
     assert views[name]["rms"] < score["rms"]
@@ -55,7 +55,7 @@ def test_the_short_run_does_not_depend_on_the_withheld_view(measurement, tmp_pat
     scores = []
     for number, data in enumerate((measurement, other)):
         reconstruct_into(tmp_path / str(number), data, VOXELS, SILENT)
-        scores.append(ResultDirectory(tmp_path / str(number)).metrics()["cross_validation"]["views"][0]["cc"])
+        scores.append(ResultDirectory(tmp_path / str(number)).metrics().cross_validation["views"][0]["cc"])
     assert scores[0] == pytest.approx(-scores[1], abs=1e-6)
 
 
@@ -71,9 +71,9 @@ def test_skipped(measurement, tmp_path, reason):
         run = replace(run, start_from=tmp_path / "start")
     out = ResultDirectory(tmp_path / "r")
     reconstruct_into(out.path, measurement, VOXELS, run)
-    assert "cross_validation" not in out.metrics()
+    assert out.metrics().cross_validation is None
     assert not out.cross_validation.path.exists()
-    assert [v["name"] for v in out.metrics()["views"] if v["withheld"]] == withhold
+    assert [v["name"] for v in out.metrics().views if v["withheld"]] == withhold
 
 
 def test_views_may_have_the_names_of_options():
@@ -91,15 +91,15 @@ def test_an_interrupted_run_resumes_to_the_same_result(measurement, tmp_path, in
     stop = {"monitor": short} if in_short_run else {"on_step": lambda step: step.step == 30}
     first = reconstruct_into(out.path, measurement, NETWORK, SILENT, **stop)
     assert first.outcome.reason == "interrupted"
-    withheld = [v["name"] for v in out.metrics()["views"] if v["withheld"]]
+    withheld = [v["name"] for v in out.metrics().views if v["withheld"]]
     assert withheld == ([best_covered(measurement.cameras)[0]] if in_short_run else [])
-    scores = out.metrics().get("cross_validation")
+    scores = out.metrics().cross_validation
     reconstruct_into(out.path, measurement, NETWORK, SILENT, resume=True)
     points = torch.rand(20, 3)
     assert torch.equal(out.field()[0](points), complete.field()[0](points))
-    assert in_short_run or out.metrics()["cross_validation"] == scores
-    assert out.metrics()["cross_validation"]["views"] == complete.metrics()["cross_validation"]["views"]
-    assert not any(v["withheld"] for v in out.metrics()["views"])
+    assert in_short_run or out.metrics().cross_validation == scores
+    assert out.metrics().cross_validation["views"] == complete.metrics().cross_validation["views"]
+    assert not any(v["withheld"] for v in out.metrics().views)
 
 
 def test_the_command_line_resumes_the_short_run(measurement, tmp_path, capsys, monkeypatch):

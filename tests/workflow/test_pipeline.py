@@ -40,8 +40,8 @@ def test_the_directory_is_complete_and_kept(made, measurement, capsys):
     assert {p.name for p in out.path.iterdir()} == {WRITTEN, *FILES} - {REPORT, CALIBRATION, *MERIDIAN}
     content = out.read()
     assert not content.missing
-    assert [v["name"] for v in content.metrics["views"] if v["withheld"]] == ["144deg"]
-    assert [r["error_px"] for r in content.metrics["reprojection"]] == [0]
+    assert [v["name"] for v in content.metrics.views if v["withheld"]] == ["144deg"]
+    assert [r["error"] for r in content.metrics.reprojection] == [0]
     assert (content.settings["method"], content.settings["voxels"]) == ("tikhonov", 8)
     field, box, n_ambient = out.field()
     assert (box, n_ambient) == (measurement.box, measurement.n_ambient)
@@ -77,8 +77,8 @@ def test_field_and_volumes_are_written_before_the_reprojection(measurement, tmp_
     with pytest.raises(KeyboardInterrupt):
         reconstruct_into(out.path, measurement, QUICK)
     assert all(out.has(name) for name in ("field.safetensors", "volume.nc", "volume.vti", "history.csv"))
-    assert out.metrics()["outcome"]
-    assert "views" not in out.metrics()
+    assert out.metrics().outcome
+    assert not out.metrics().views
 
 
 def test_corners_beyond_the_distortion_are_left_out_and_reported(measurement, tmp_path):

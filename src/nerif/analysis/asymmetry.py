@@ -133,8 +133,8 @@ def withhold_half(
 def asymmetry(measurement: Measurement, symmetry: Symmetry) -> list[dict[str, Any]]:
     """Return how far each view departs from that of an axisymmetric flow.
 
-    `cc` is the correlation of each channel with its reflection, `departure` the rms of the antisymmetric part over the
-    rms of the signal, both without noise where sigma is known.
+    `cc` is the correlation of each channel with its reflection, `antisymmetry` the rms of the antisymmetric part over
+    the rms of the signal, both without noise where sigma is known.
     """
     rows = []
     for view, camera in enumerate(measurement.cameras):
@@ -151,7 +151,7 @@ def asymmetry(measurement: Measurement, symmetry: Symmetry) -> list[dict[str, An
 def asymmetry_sentence(row: Mapping[str, Any]) -> str:
     """Return one row of `asymmetry` in words."""
     cc = ", ".join(f"{name} {value:.3f}" for name, value in row["cc"].items())
-    share = f"{row['departure']:.0%} of the signal is antisymmetric"
+    share = f"{row['antisymmetry']:.0%} of the signal is antisymmetric"
     return f"{row['name']}: the halves of the {row['measured']} correlate by {cc}; {share}"
 
 
@@ -176,7 +176,7 @@ def _of_view(
     if o.sigma is not None:
         noise = float(o.sigma[view, :height, :width].double().reshape(len(pixels), -1)[both].square().mean())
         antisymmetric, signal = max(antisymmetric - noise, 0.0), max(signal - noise, 0.0)
-    return {"cc": cc, "departure": math.sqrt(antisymmetric / signal)} if signal > 0 else None
+    return {"cc": cc, "antisymmetry": math.sqrt(antisymmetric / signal)} if signal > 0 else None
 
 
 def _interpolated(image: Float[Tensor, "row column c"], pixels: Float[Tensor, "n 2"]) -> Float[Tensor, "n c"]:

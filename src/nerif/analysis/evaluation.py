@@ -32,6 +32,7 @@ from nerif.plotting.notebook import number
 from nerif.reconstruction.aperture import apply_aperture
 from nerif.reconstruction.rig.parameters import with_corrections
 from nerif.results.directory import METRICS, VOLUME, ResultDirectory
+from nerif.results.metrics import Metrics, ViewScores
 
 FLOW = 0.02  # share of the largest excess, above which a voxel counts as flow
 ALIGNMENTS = ("none", "rigid")
@@ -87,32 +88,27 @@ def evaluate(
         metrics["quantity"] = quantity
         metrics["truth"] = str(Path(truth).resolve())
     if data is not None:
-        settings, stored = directory.settings(), directory.metrics() if directory.has(METRICS) else {}
-        data, names = withhold_half(
-            data, settings.get("withhold", ()) if withhold is None else withhold, stored.get("axis")
-        )
+        settings, stored = directory.settings(), directory.metrics() if directory.has(METRICS) else Metrics()
+        data, names = withhold_half(data, settings.get("withhold", ()) if withhold is None else withhold, stored.axis)
         unknown = [name for name in names if name not in data.names]
         if unknown and withhold is not None:
             raise InputError(f"expected views of {', '.join(data.names)}, got '{unknown[0]}'", field="withhold")
         withheld = tuple(name for name in names if name in data.names)
         aperture = "off" if settings.get("aperture", "off") == "off" else "auto"
         data = with_gains(apply_aperture(data, aperture), gains_of(settings))
-        data = with_corrections(data, stored.get("rig", []))
+        data = with_corrections(data, stored.rig)
         views = reproject(field, data, withheld, on_view=on_view, model=str(settings.get("model", AUTO)))
         metrics |= {"views": evaluate_views(views), "reprojection": [a.entries for a in views.accuracies]}
         metrics["measurement"] = str(Path(str(measurement)).resolve())
         directory.write_reprojection(views)
-    directory.add_metrics(metrics)
+    directory.add_metrics(**metrics)
     return metrics
 
 
-def evaluate_views(reprojection: Reprojection) -> list[dict[str, Any]]:
+def evaluate_views(reprojection: Reprojection) -> list[ViewScores]:
     """Compare every view with its prediction over the usable pixels whose rays cross the box.
 
-    cc, ssim, psnr and rms (of images: of their change by the flow), the rms in the unit of the technique, also
-    rms_UNIT; pixels: their number. rms_measured, rms_predicted and rms_sigma are those of the measurement, the
-    prediction and sigma, rms_white that of the pixel-to-pixel noise. With sigma, rms_over_sigma is 1 where the
-    residual is noise; residual_test is the test of its whiteness (residuals.py), given enough pixels.
+    Of images, their changes by the flow are compared.
     """
     from concurrent.futures import ThreadPoolExecutor
 
@@ -121,7 +117,7 @@ def evaluate_views(reprojection: Reprojection) -> list[dict[str, Any]]:
     for model in models.values():
         model.prepare()
 
-    def scores(view: int, observation: Observation, valid: Bool[Tensor, "view row column"]) -> dict[str, Any]:
+    def scores(view: int, observation: Observation, valid: Bool[Tensor, "view row column"]) -> Any:
         camera, kind = measurement.cameras[view], observation.technique
         height, width = camera.image_size
         inside = view, slice(0, height), slice(0, width)
@@ -133,8 +129,6 @@ def evaluate_views(reprojection: Reprojection) -> list[dict[str, Any]]:
             still = models[kind].to_map(torch.zeros(height, width, kind.integrals), view)
             measured, predicted = measured - still, predicted - still
         row |= view_metrics(measured.numpy(), predicted.numpy(), mask.numpy())
-        if kind.unit != "1":
-            row[f"rms_{kind.unit}"] = row["rms"]
         residual = measured - predicted
         row |= {"pixels": int(mask.sum()), "rms_predicted": _rms(predicted[mask]), "rms_measured": _rms(measured[mask])}
         if (white := white_noise(residual.nan_to_num(0.0, 0.0, 0.0).numpy(), mask.numpy())) is not None:
@@ -147,7 +141,7 @@ def evaluate_views(reprojection: Reprojection) -> list[dict[str, Any]]:
         test = whiteness(residual.nan_to_num(0.0, 0.0, 0.0).numpy(), patterns, mask.numpy())
         return row if test is None else {**row, "residual_test": {**asdict(test), "correlated": test.correlated}}
 
-    views: list[dict[str, Any]] = []
+    views: list[ViewScores] = []
     threads = int(min(torch.get_num_threads(), PARALLEL_PIXELS // sees_box[0].numel()))
     for o in measurement.observations:
         valid = measurement.usable_for(o) & sees_box
@@ -162,12 +156,12 @@ def _rms(values: Tensor) -> float:
     return float(values.square().mean().sqrt())  # NaN of no pixels
 
 
-def rms_with_unit(view: dict[str, Any], digits: int = 4) -> str:
+def rms_with_unit(view: ViewScores, digits: int = 4) -> str:
     """Return the rms error of a view with its unit."""
     return with_unit(number(view.get("rms"), digits), view["unit"])
 
 
-def score_lines(views: list[dict[str, Any]]) -> list[str]:
+def score_lines(views: list[ViewScores]) -> list[str]:
     """Return a line with the worst scores of the training views and one of the withheld views, for each technique."""
     lines = []
     measured = dict.fromkeys(v["measured"] for v in views)
@@ -202,7 +196,7 @@ def evaluate_aligned(field: Field, truth: Volume, n_ambient: float) -> dict[str,
     moved = aligned(field, truth)
     scores = evaluate_volume(moved, truth, n_ambient)
     del scores["slices"]
-    return {**scores, "turn_rad": moved.turn.tolist(), "shift_mm": moved.shift.tolist()}
+    return {**scores, "rotation_rad": moved.turn.tolist(), "shift_mm": moved.shift.tolist()}
 
 
 def check_inside(path: Path, truth: Box, box: Box) -> None:

@@ -109,7 +109,7 @@ def coverage(
 ) -> dict[str, float | list[float]]:
     """Return how often errors lie within standard deviations, everywhere and in the flow.
 
-    share and share_in_flow: within two standard deviations; share_in_one and share_in_one_in_flow: within one;
+    one_sigma, two_sigma: within one and two standard deviations, also _in_flow;
     reliability: in the flow, within the interval of each of LEVELS; spearman: rank correlation of |error| and std.
 
     Source: Guo et al., On calibration of modern neural networks, Proc. ICML (2017), for the diagram.
@@ -120,10 +120,10 @@ def coverage(
     one, two = size <= std, size <= 2 * std
     z = [float(norm.ppf((1 + level) / 2)) for level in LEVELS]
     return {
-        "share": float(two.mean()),
-        "share_in_flow": float(two[inside].mean()),
-        "share_in_one": float(one.mean()),
-        "share_in_one_in_flow": float(one[inside].mean()),
+        "two_sigma": float(two.mean()),
+        "two_sigma_in_flow": float(two[inside].mean()),
+        "one_sigma": float(one.mean()),
+        "one_sigma_in_flow": float(one[inside].mean()),
         "reliability": [float((size[inside] <= k * std[inside]).mean()) for k in z],
         "spearman": float(spearmanr(size, std).statistic),
     }

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from nerif.common.findings import Finding
 from nerif.data.measurement import Measurement
@@ -13,7 +12,7 @@ from nerif.reconstruction.aperture import apply_aperture
 from nerif.reconstruction.device import on_free_cores
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.progress import QUIET, Monitor
-from nerif.reconstruction.rig.parameters import MOVED, refinement_lines
+from nerif.reconstruction.rig.parameters import MOVED, RefinedView, refinement_lines
 from nerif.reconstruction.rig.posterior import with_posterior
 from nerif.reconstruction.shared_settings import Aperture
 from nerif.reconstruction.sources import of_source
@@ -34,7 +33,7 @@ class RigCheck:
     findings : impossible camera poses, and significant pose errors
     """
 
-    table: list[dict[str, Any]]
+    table: list[RefinedView]
     remarks: tuple[str, ...]
     findings: tuple[Finding, ...]
 
@@ -65,7 +64,7 @@ def check_rig(
     with monitor.counting("accuracy of the rig") as bar:
         table = with_posterior(result.rig, apply_aperture(data, aperture), result.field, result.settings, bar)
     lines = refinement_lines(table)
-    moved = [row["name"] for row in table if row["moved"] > MOVED]
+    moved = [row["name"] for row in table if row["correction_over_sigma"] > MOVED]
     first = len(lines) - len(moved)
     remarks = lines[:first]
     worst = max(table, key=lambda row: row.get("rms_after", 0.0))

@@ -26,17 +26,17 @@ import math
 import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from nerif.analysis.asymmetry import camera_of
 from nerif.analysis.residuals import CAUSES
 from nerif.data.volume import field_of
 from nerif.forward.registry import TECHNIQUES
 from nerif.results.directory import Result
+from nerif.results.metrics import HalfAsymmetry, ResidualTest, ViewScores
 
-__all__ = ["WORDS", "Estimate", "Verdict", "correlated_share", "verdict"]
+__all__ = ["RATINGS", "Estimate", "Verdict", "correlated_share", "verdict"]
 
-WORDS = ("use", "use with care", "do not use", "cannot tell")
+RATINGS = ("use", "use with care", "do not use", "cannot tell")
 
 A_WITHHELD, A_FIRST_RUN = 0.25, 0.4  # A, for a view withheld from the whole run and from a first one
 B_MISFIT, C_NOISE, N0_PIXELS = 0.8, 0.2, 8000
@@ -58,7 +58,8 @@ ONE_CAMERA = (
     "the mm per px at the background over the distance from flow to background"
 )
 
-View = dict[str, Any]
+View = ViewScores
+WHITE = ResidualTest(grain=1.0, white=True, cause="", share=0.0, row=0.0, column=0.0, correlated=0.0)
 
 
 @dataclass(frozen=True)
@@ -98,45 +99,44 @@ class Verdict:
 
     Parameters
     ----------
-    word : one of WORDS
+    rating : one of RATINGS
     error : estimated relative error of the variation, or None
-    why : the reasons
+    reasons : for it
     low, high : range of the error, or None
     """
 
-    word: str
+    rating: str
     error: float | None
-    why: str
+    reasons: str
     low: float | None = None
     high: float | None = None
 
     @classmethod
-    def of(cls, word: str, estimate: Estimate | None, reasons: Sequence[str], joint: str = "; ") -> Verdict:
+    def of(cls, rating: str, estimate: Estimate | None, reasons: Sequence[str], joint: str = "; ") -> Verdict:
         """Return a verdict with its reasons, the basis of the estimate first."""
-        why = joint.join(reason for reason in reasons if reason)
+        text = joint.join(reason for reason in reasons if reason)
         if estimate is None:
-            return cls(word, None, why)
-        basis = f"{estimate.basis}{joint if why else ''}{why}"
-        return cls(word, estimate.error, basis, estimate.low, estimate.high)
+            return cls(rating, None, text)
+        basis = f"{estimate.basis}{joint if text else ''}{text}"
+        return cls(rating, estimate.error, basis, estimate.low, estimate.high)
 
     @property
     def sentence(self) -> str:
         """The verdict with its reasons."""
-        head = f"{self.word[0].upper()}{self.word[1:]}: "
+        head = f"{self.rating[0].upper()}{self.rating[1:]}: "
         if self.error is None:
-            return f"{head}{self.why}."
+            return f"{head}{self.reasons}."
         span = "" if self.low is None or self.high is None else f" ({_percent(self.low)} to {_percent(self.high)})"
-        return f"{head}estimated relative error of the variation {_percent(self.error)}{span}, {self.why}."
+        return f"{head}estimated relative error of the variation {_percent(self.error)}{span}, {self.reasons}."
 
 
 def verdict(result: Result) -> Verdict:
     """Judge a result by its metrics, and its standard deviations where it has some."""
     metrics = result.metrics
-    outcome = metrics.get("outcome")
+    outcome = metrics.outcome
     if outcome in ("diverged", "collapsed"):
         return Verdict.of("do not use", None, [f"the run {outcome}"])
-    views = metrics.get("views")
-    views = [v for v in views if _complete(v)] if isinstance(views, list) else []
+    views = [v for v in metrics.views if _complete(v)]
     fitted, withheld = ([v for v in views if bool(v["withheld"]) is role] for role in (False, True))
     for group, role in ((fitted, "training"), (withheld, "withheld")):
         share = _explained(group, _noise(fitted))
@@ -149,10 +149,10 @@ def verdict(result: Result) -> Verdict:
         other = Estimate.within(deviation, DEVIATIONS_FACTOR, "from its standard deviations")
         estimate = other if estimate is None else estimate.mean(other)
     doubt, severe = _contradiction(fitted)
-    symmetry = (metrics.get("axis") or {}).get("symmetry") or {}
+    symmetry = metrics.axis["symmetry"] if metrics.axis else {}
     axisymmetric = bool(symmetry) and not symmetry.get("harmonics")  # with harmonics the halves may differ
-    if axisymmetric and any(d["departure"] > ASYMMETRIC for d in metrics.get("asymmetry") or []):
-        uneven, not_symmetric = _asymmetry(metrics["asymmetry"])
+    if axisymmetric and any(d["antisymmetry"] > ASYMMETRIC for d in metrics.asymmetry):
+        uneven, not_symmetric = _asymmetry(metrics.asymmetry)
         doubt, severe = "; ".join(filter(None, (uneven, doubt))), severe or not_symmetric
     if severe:
         return Verdict.of("do not use", None, [doubt])
@@ -180,8 +180,8 @@ def _percent(share: float) -> str:
     return f"{100 * share:.2g} %" if share < 0.1 else f"{100 * share:.0f} %"
 
 
-def _complete(view: Any) -> bool:
-    return isinstance(view, dict) and bool(view.get("rms_predicted")) and view.get("rms") is not None
+def _complete(view: View) -> bool:
+    return view["rms_predicted"] > 0 and math.isfinite(view["rms"])
 
 
 def _quantities(views: Sequence[View]) -> list[str]:
@@ -230,18 +230,19 @@ def _from_views(
     result: Result, withheld: Sequence[View], fitted: Sequence[View]
 ) -> tuple[Estimate | None, str]:  # fmt: skip
     """The estimate from withheld views, of the whole run else of cross-validation; or None, and why there is none."""
-    first = result.metrics.get("cross_validation") or {}
-    first_fitted = [v for v in first.get("fitted_views") or [] if _complete(v)]
+    first = result.metrics.cross_validation
+    first_views, first_fitted = (first["views"], first["fitted_views"]) if first else ([], [])
+    first_fitted = [v for v in first_fitted if _complete(v)]
     noise = _noise(fitted)
     for views, basis in (
         (withheld, "cross-validated on a withheld view"),
-        (first.get("views") or [], "cross-validated in a first run without a view"),
+        (first_views, "cross-validated in a first run without a view"),
     ):
         usable = [v for v in views if _complete(v) and v["measured"] in noise and v["measured"] in _quantities(views)]
         if not usable:
             continue
         largest, factor = max(_withheld(v, noise) for v in usable), A_WITHHELD
-        if views is first.get("views"):
+        if views is first_views:
             share = _explained(first_fitted, noise)
             if share is not None and share < MIN_EXPLAINED:
                 run = f"the first run, without view {usable[0]['name']}, was too short for cross-validation"
@@ -319,7 +320,7 @@ def _contradiction(fitted: Sequence[View]) -> tuple[str, bool]:
         group = [v for v in fitted if v["measured"] == name]
         parts = {v["name"]: correlated_share(v) for v in group}
         median, worst = statistics.median(parts.values()), max(parts, key=lambda k: parts[k])
-        tests = {v["name"]: v.get("residual_test") or {"grain": 1.0, "cause": ""} for v in group}
+        tests = {v["name"]: v.get("residual_test", WHITE) for v in group}
         doubtful = [
             view for view, test in tests.items()
             if test["grain"] > DOUBTFUL[0] and parts[view] > DOUBTFUL[1]
@@ -339,10 +340,10 @@ def _contradiction(fitted: Sequence[View]) -> tuple[str, bool]:
     return "", False
 
 
-def _asymmetry(asymmetry: Sequence[dict[str, Any]]) -> tuple[str, bool]:
+def _asymmetry(asymmetry: Sequence[HalfAsymmetry]) -> tuple[str, bool]:
     """How far the measurement is from axisymmetric, and whether too far."""
-    worst = max(asymmetry, key=lambda d: d["departure"])
-    cc, share = min(worst["cc"].values()), worst["departure"]
+    worst = max(asymmetry, key=lambda d: d["antisymmetry"])
+    cc, share = min(worst["cc"].values()), worst["antisymmetry"]
     halves = f"the halves of {worst['name']} correlate by {cc:.2f}, and {share:.0%} of the signal is antisymmetric"
     severe = share > NOT_SYMMETRIC
     return f"the flow is {'not' if severe else 'only roughly'} axisymmetric: {halves}", severe

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass
 from html import escape
@@ -17,6 +18,7 @@ from nerif.reconstruction.files import FIELD
 from nerif.report.movie import finished_frames
 from nerif.report.summary import accuracy_rows
 from nerif.results.directory import LIVE, METRICS, RUN, VOLUME, Result, ResultDirectory
+from nerif.results.metrics import Metrics
 
 __all__ = ["Row", "result_table", "rows_of"]
 
@@ -61,12 +63,12 @@ def _cached(project: Project, name: str) -> Row:
 
 def _of(name: str, result: Result) -> Row:
     judgement, metrics = verdict(result), result.metrics
-    views = [v for v in metrics.get("views", []) if v.get("rms") is not None]
-    worst = rms_with_unit(max(views, key=lambda v: float(v["rms"])), 3) if views else ""
-    outcome = str(metrics.get("outcome") or result.about.get("outcome") or "not ended").replace("_", " ")
-    seconds = metrics.get("seconds", result.about.get("seconds"))
+    views = [v for v in metrics.views if math.isfinite(v["rms"])]
+    worst = rms_with_unit(max(views, key=lambda v: v["rms"]), 3) if views else ""
+    outcome = str(metrics.outcome or result.about.get("outcome") or "not ended").replace("_", " ")
+    seconds = metrics.seconds if metrics.seconds is not None else result.about.get("seconds")
     error = "" if judgement.error is None else f"{judgement.error:.1%} of the variation"
-    ended, word, sentence = bool(metrics), judgement.word, judgement.sentence
+    ended, word, sentence = metrics != Metrics(), judgement.rating, judgement.sentence
     if not ended:
         word, sentence = "", " ".join(gap.sentence for gap in result.missing) or "No data yet."
     time = "" if seconds is None else f"{float(seconds):.0f} s"

@@ -29,31 +29,31 @@ class Accuracy:
     Parameters
     ----------
     technique : quantity that a pixel measures
-    how : method in words
-    error : rms difference from the path integral through the field over the compared pixels, in the technique's unit
-    compared : number of pixels compared; 0 if the prediction is that integral
+    method : in words
+    error : rms difference from the path integral through the field over some pixels, in the technique's unit
+    pixels : number compared; 0 if the prediction is that integral
     """
 
     technique: type[ForwardModel]
-    how: str = "the path integral through the field on every pixel"
+    method: str = "the path integral through the field on every pixel"
     error: float = 0.0
-    compared: int = 0
+    pixels: int = 0
 
     @property
     def sentence(self) -> str:
         """Report of method and error."""
-        method = f"{self.technique.measured} re-projected by {self.how}"
-        if not self.compared:
+        method = f"{self.technique.measured} re-projected by {self.method}"
+        if not self.pixels:
             return method
         error = f"{with_unit(f'{self.error:.2g}', self.technique.unit)} rms"
-        return f"{method}; {error} from the path integral through the network on {self.compared} pixels"
+        return f"{method}; {error} from the path integral through the network on {self.pixels} pixels"
 
     @property
     def entries(self) -> dict[str, Any]:
-        """Entries of metrics.json; also error_px where the unit is px."""
+        """Entries of metrics.json."""
         kind = self.technique
-        entries = {"measured": kind.measured, "unit": kind.unit, "how": self.how, "error": self.error}
-        return entries | ({"error_px": self.error} if kind.in_pixels() else {}) | {"compared": self.compared}
+        summary = {"measured": kind.measured, "unit": kind.unit, "method": self.method}
+        return {**summary, "error": self.error, "pixels": self.pixels}
 
 
 @dataclass(frozen=True)
@@ -93,11 +93,9 @@ class Reprojection:
         attributes = {"units": "1", "long_name": "1: withheld from the reconstruction"}
         dataset["withheld"] = (("view",), withheld, attributes)
         for accuracy in self.accuracies:
-            dataset.attrs["predicted_by"] = accuracy.how
+            dataset.attrs["predicted_by"] = accuracy.method
             if accuracy.technique.measured in dataset:  # displacements of a measurement of images only
                 dataset[accuracy.technique.measured].attrs["predicted_error"] = accuracy.error
-            if accuracy.technique.in_pixels():
-                dataset.attrs["predicted_error_px"] = accuracy.error
         with atomic(path) as part:
             dataset.to_netcdf(part, engine="h5netcdf", encoding=encoding(dataset))
 

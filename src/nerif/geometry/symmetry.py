@@ -238,20 +238,20 @@ class Axis:
     Parameters
     ----------
     values : of NAMES, relative to the initial axis
-    sigma, sigma_after : their prior and posterior standard deviations; sigma 0 for a parameter that was not refined
+    prior_sigma, posterior_sigma : their standard deviations; prior 0 for a parameter that was not refined
     residual : rms over sigma of a coarse reconstruction (over the rms of the data, if sigma is unknown)
     """
 
     symmetry: Symmetry
     values: tuple[float, ...]
-    sigma: tuple[float, ...]
-    sigma_after: tuple[float, ...]
+    prior_sigma: tuple[float, ...]
+    posterior_sigma: tuple[float, ...]
     residual: float
 
     @property
     def constrained(self) -> tuple[bool, ...]:
         """Whether the data constrain each of the parameters."""
-        pairs = zip(self.sigma, self.sigma_after, strict=True)
+        pairs = zip(self.prior_sigma, self.posterior_sigma, strict=True)
         return tuple(prior > 0 and after < MAX_POSTERIOR * prior for prior, after in pairs)
 
     @property
@@ -259,8 +259,8 @@ class Axis:
         """Entries of metrics.json."""
         columns = {
             "values": self.values,
-            "sigma": self.sigma,
-            "sigma_after": self.sigma_after,
+            "prior_sigma": self.prior_sigma,
+            "posterior_sigma": self.posterior_sigma,
             "constrained": self.constrained,
         }
         named = {key: dict(zip(NAMES, column, strict=True)) for key, column in columns.items()}
@@ -279,9 +279,9 @@ class Axis:
             )
             direction = _vector(self.symmetry.frame[i % 2])
             if self.constrained[i]:
-                value, sigma = self.values[i] * factor, self.sigma_after[i] * factor
+                value, sigma = self.values[i] * factor, self.posterior_sigma[i] * factor
                 lines.append(f"{noun} towards {direction}: {value:+.3g} +- {sigma:.2g} {unit}")
-            elif self.sigma[i]:
+            elif self.prior_sigma[i]:
                 lines.append(f"The {noun} towards {direction} cannot be determined; kept at its initial value")
         return lines
 

@@ -18,6 +18,7 @@ from nerif.data.volume import Volume, describe
 from nerif.fields.base import Field
 from nerif.geometry import Box, Grid
 from nerif.geometry.symmetry import Axis
+from nerif.reconstruction.rig.parameters import RefinedView
 
 __all__ = ["OnStep", "Outcome", "Reconstruction", "Reconstructor", "State", "Step", "compose"]
 
@@ -124,7 +125,7 @@ class Reconstruction:
     device: str = "cpu"
     state: State | None = dataclasses.field(default=None, repr=False)
     quantity: str = "index_excess"
-    rig: list[dict[str, Any]] = dataclasses.field(default_factory=list)
+    rig: list[RefinedView] = dataclasses.field(default_factory=list)
     axis: Axis | None = None
 
     @property

@@ -111,11 +111,11 @@ def find_axis(
         after = torch.linalg.inv(curvature).diagonal().sqrt()
         if bool((step.abs() < CONVERGED * after).all()):
             break
-    sigma_after = torch.tensor(before, dtype=torch.float64)
-    sigma_after[refined] = after * scales
+    posterior_sigma = torch.tensor(before, dtype=torch.float64)
+    posterior_sigma[refined] = after * scales
     fit = replace(about(values), harmonics=symmetry.harmonics)
     unit = math.sqrt(target.chi_square) if target.sigma_known else 1.0
-    return Axis(fit, tuple(values.tolist()), before, tuple(sigma_after.tolist()), math.sqrt(level) * unit)
+    return Axis(fit, tuple(values.tolist()), before, tuple(posterior_sigma.tolist()), math.sqrt(level) * unit)
 
 
 def _across(measurement: Measurement, symmetry: Symmetry) -> tuple[Symmetry, tuple[float, float]]:

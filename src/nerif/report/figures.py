@@ -11,7 +11,9 @@ from nerif.analysis.metrics import LEVELS
 from nerif.data.volume import Volume
 from nerif.geometry import Camera
 from nerif.plotting.drawing import COLOURS, label_of, plotted_quantities, plotted_values
+from nerif.reconstruction.rig.parameters import RefinedView
 from nerif.reconstruction.uncertainty.bootstrap import TAILS
+from nerif.results.metrics import ViewScores
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -64,11 +66,11 @@ def draw_history(axes: Axes, history: list[dict[str, float]], method: str) -> Ax
     return axes
 
 
-def draw_slice_scores(axes: Axes, slices: list[dict[str, Any]]) -> Axes:
+def draw_slice_scores(axes: Axes, slices: Sequence[Any]) -> Axes:
     """Draw SSIM and CC of slices across z against the truth."""
     z = [s["z_mm"] for s in slices]
     for name, marker, colour in (("cc", "o", COLOURS["blue"]), ("ssim", "s", COLOURS["orange"])):
-        values = [np.nan if s.get(name) is None else s[name] for s in slices]
+        values = [s[name] for s in slices]
         axes.plot(z, values, marker=marker, markersize=3, linewidth=1, color=colour, label=name.upper())
     axes.set(xlabel="z [mm]", ylabel="CC, SSIM of a slice [1]")
     axes.grid(**GRID)
@@ -76,16 +78,16 @@ def draw_slice_scores(axes: Axes, slices: list[dict[str, Any]]) -> Axes:
     return axes
 
 
-def draw_view_scores(axes: Axes, views: list[dict[str, Any]]) -> Axes:
+def draw_view_scores(axes: Axes, views: list[ViewScores]) -> Axes:
     """Draw the rms error of every view, over the noise if that is known for all; withheld views are hatched."""
-    in_sigma = all(v.get("rms_over_sigma") is not None for v in views)
+    in_sigma = all(np.isfinite(v.get("rms_over_sigma", np.nan)) for v in views)
     several = len({v["measured"] for v in views}) > 1
     names = []
     for place, view in enumerate(views):
-        value, withheld = view.get("rms_over_sigma" if in_sigma else "rms"), view["withheld"]
+        value, withheld = view["rms_over_sigma"] if in_sigma else view["rms"], view["withheld"]
         name = f"{view['name']}{', ' + view['measured'] if several else ''}"
         names.append(f"{name}\nwithheld" if withheld else name)
-        if value is not None:
+        if np.isfinite(value):
             colour, hatch = (COLOURS["orange"], "///") if withheld else (COLOURS["blue"], None)
             axes.bar(place, value, width=0.7, color=colour, hatch=hatch, edgecolor="white", linewidth=0)
     if in_sigma:
@@ -172,14 +174,14 @@ def draw_reliability(axes: Axes, coverage: Mapping[str, Any]) -> Axes:
     return axes
 
 
-def draw_corrections(axes: Axes, table: Sequence[dict[str, Any]]) -> Axes:
+def draw_corrections(axes: Axes, table: Sequence[RefinedView]) -> Axes:
     """Draw each pose correction of each view over its prior standard deviation; bars are the posterior ones."""
     names = list(table[0]["values"])
     for i, row in enumerate(table):
-        prior = [row["sigma"][name] for name in names]
+        prior = [row["prior_sigma"][name] for name in names]
         refined = [n for n, sigma in enumerate(prior) if sigma > 0]
         values = [row["values"][names[n]] / prior[n] for n in refined]
-        posterior = [row.get("sigma_after", {}).get(names[n], 0.0) / prior[n] for n in refined]
+        posterior = [row.get("posterior_sigma", {}).get(names[n], 0.0) / prior[n] for n in refined]
         place = np.array(refined) + 0.7 * ((i + 0.5) / len(table) - 0.5)
         axes.errorbar(place, values, yerr=posterior, fmt="o", ms=3, lw=0.8, label=row["name"])
     for limit in (-3, 3):
@@ -191,7 +193,7 @@ def draw_corrections(axes: Axes, table: Sequence[dict[str, Any]]) -> Axes:
     return axes
 
 
-def draw_refined_rig(axes: Axes, cameras: Sequence[Camera], table: Sequence[dict[str, Any]]) -> Axes:
+def draw_refined_rig(axes: Axes, cameras: Sequence[Camera], table: Sequence[RefinedView]) -> Axes:
     """Draw the rig from above: circles as calibrated, enlarged arrows to the refined positions.
 
     Parameters

@@ -46,11 +46,10 @@ def write(page: str, path: Path) -> None:
 def render(result: Result) -> str:
     """Return the page of a result, complete or not."""
     scene, arrays = scene_of(result)
-    scores = result.metrics.get("views")
-    scores = scores if isinstance(scores, list) else []
+    scores = result.metrics.views
     views, scales = ([], []) if result.reprojection is None else view_images(result.reprojection, scores)
     meridian = result.meridian
-    measurement = result.metrics.get("measurement", result.settings.get("measurement"))
+    measurement = result.metrics.measurement or result.settings.get("measurement")
     return render_page(
         kind=_kind(result),
         title=result.directory.resolve().name,
@@ -78,8 +77,8 @@ def render(result: Result) -> str:
             for q in plotted_quantities(result.volumes)
             if "assumption" in result.volumes[q].notes
         ],
-        trials=result.metrics.get("uncertainty"),
-        coverage=result.metrics.get("coverage"),
+        trials=result.metrics.uncertainty,
+        coverage=result.metrics.coverage,
         settings=flat(result.settings),
         about=flat(result.about),
     )
@@ -139,16 +138,16 @@ def _curves(result: Result) -> list[tuple[str, str]]:
         several = len(result.reprojection.measurement.observations) > 1
         for name, residuals in residuals_over_sigma(result.reprojection).items():
             add(f"Residuals{f' of {name}' if several else ''} over the noise", figures.draw_residuals, residuals)
-    if rig := metrics.get("rig"):
+    if rig := metrics.rig:
         add("Corrections of the cameras", figures.draw_corrections, rig)
         if result.reprojection is not None:
             add("Refined camera positions", figures.draw_refined_rig, result.reprojection.measurement.cameras, rig)
     for quantity in figures.banded(result.volumes):
         add(f"{name_of(quantity).capitalize()} with bands of 90 %", figures.draw_bands, result.volumes, quantity)
-    if "reliability" in (metrics.get("coverage") or {}):
-        add("Reliability of the bands, against the truth", figures.draw_reliability, metrics["coverage"])
-    if metrics.get("slices"):
-        add("Against the truth, slice by slice", figures.draw_slice_scores, metrics["slices"])
+    if metrics.coverage and "reliability" in metrics.coverage:
+        add("Reliability of the bands, against the truth", figures.draw_reliability, metrics.coverage)
+    if metrics.slices:
+        add("Against the truth, slice by slice", figures.draw_slice_scores, metrics.slices)
     return curves
 
 

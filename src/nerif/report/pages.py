@@ -99,19 +99,19 @@ def figures_of(result: Result, single: float, double: float) -> Iterator[tuple[s
         for measured, residuals in residuals_over_sigma(result.reprojection).items():
             yield f"residuals_{measured}" if several else "residuals", plot(0.7, figures.draw_residuals, residuals)
         yield "rig", rig(result.reprojection, double)
-    if metrics.get("rig"):
-        yield "moves", plot(0.8, figures.draw_corrections, metrics["rig"])
-    if metrics.get("views"):
-        yield "views", plot(0.8, figures.draw_view_scores, metrics["views"])
+    if metrics.rig:
+        yield "corrections", plot(0.8, figures.draw_corrections, metrics.rig)
+    if metrics.views:
+        yield "views", plot(0.8, figures.draw_view_scores, metrics.views)
     for quantity in figures.banded(result.volumes):
         yield f"bands_{quantity}", plot(0.7, figures.draw_bands, result.volumes, quantity)
-    if "reliability" in (metrics.get("coverage") or {}):
-        yield "reliability", plot(0.9, figures.draw_reliability, metrics["coverage"])
+    if metrics.coverage and "reliability" in metrics.coverage:
+        yield "reliability", plot(0.9, figures.draw_reliability, metrics.coverage)
     if result.history:
         method = str(result.settings.get("method", "nerif"))
         yield "history", plot(0.7, figures.draw_history, result.history, method)
-    if metrics.get("slices"):
-        yield "slice_scores", plot(0.7, figures.draw_slice_scores, metrics["slices"])
+    if metrics.slices:
+        yield "slice_scores", plot(0.7, figures.draw_slice_scores, metrics.slices)
 
 
 def _page(width: float, height_over_width: float, layout: str = "constrained") -> Figure:

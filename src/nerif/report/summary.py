@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,6 +22,7 @@ from nerif.reconstruction.files import FIELD
 from nerif.reconstruction.rig.parameters import refinement_lines
 from nerif.report.packing import relation
 from nerif.results.directory import METRICS, VOLUME, Result
+from nerif.results.metrics import ViewScores
 
 __all__ = [
     "Statement", "accuracy_rows", "cross_validated", "field_rows", "headline", "measurement_rows", "statements",
@@ -28,14 +30,14 @@ __all__ = [
 
 VITAL = (FIELD, METRICS, VOLUME)  # without these there is no verdict
 LEVELS = ("good", "note", "warning", "bad")
-LEVEL_OF_WORD = {"use": "good", "use with care": "warning", "do not use": "bad", "cannot tell": "note"}
+LEVEL_OF_RATING = {"use": "good", "use with care": "warning", "do not use": "bad", "cannot tell": "note"}
 MIN_CC = 0.95  # of a withheld view; reached in all our simulated cases with nine views
 TRUTH_CC = 0.98, 0.9  # good and fair in our simulated cases
 MAX_NAMES = 4  # of views in a sentence
 CORRELATED = 0.01  # of the signal; smaller correlated residuals change a field less than noise does
 NOISE_RANGE = 0.7, 1.4  # rms residual over sigma that noise alone explains; sigma is uncertain by a factor of about 2
 
-View = dict[str, Any]
+View = ViewScores
 Rows = list[tuple[str, str]]
 
 
@@ -76,10 +78,10 @@ def field_rows(result: Result) -> Rows:
     if result.volumes:
         shape = next(iter(result.volumes.values())).grid.shape
         rows.append(("Voxels", " × ".join(str(n) for n in shape[::-1]) + " (x, y, z)"))
-    if result.metrics.get("seconds") is not None:
-        memory = result.metrics.get("peak_memory_bytes")
+    if result.metrics.seconds is not None:
+        memory = result.metrics.peak_memory_bytes
         gib = f", {memory / 2**30:.2f} GiB" if memory else ""
-        rows.append(("Time", f"{result.metrics['seconds']:.0f} s on {result.metrics.get('device', '?')}{gib}"))
+        rows.append(("Time", f"{result.metrics.seconds:.0f} s on {result.metrics.device or '?'}{gib}"))
     return rows
 
 
@@ -110,44 +112,42 @@ def accuracy_rows(result: Result) -> Rows:
         rows.append((f"View {place}, withheld from the first run", _scores([view])))
         same = [v for v in training if (v["name"], v["measured"]) == (view["name"], view["measured"])]
         rows += [(f"View {place}, after the whole run", _scores([v])) for v in same]
-    rows += [(f"{view['name']}, camera refined", _scores([view])) for view in metrics.get("views_refitted") or []]
-    rig = [row for row in metrics.get("rig") or [] if "rms_after" in row]
+    rows += [(f"{view['name']}, camera refined", _scores([view])) for view in metrics.withheld_views]
+    rig = [row for row in metrics.rig if "rms_after" in row]
     if rig:
         before, after = (max(row[name] for row in rig) for name in ("rms_before", "rms_after"))
         rows.append(("Worst view, before and after refinement", f"rms {before:.2f} σ, {after:.2f} σ"))
-    if "outcome" in metrics:
-        rows.append(("Outcome", str(metrics["outcome"]).replace("_", " ")))
-    if metrics.get("l2") is not None and metrics.get("l2_variation") is not None:
-        errors = f"L2 {metrics['l2']:.2%}"
+    if metrics.outcome is not None:
+        rows.append(("Outcome", metrics.outcome.replace("_", " ")))
+    if metrics.l2 is not None and metrics.l2_variation is not None:
+        errors = f"L2 {metrics.l2:.2%}"
         if field_of(result.volumes) in (None, INDEX):  # the paper's L2 includes the ambient
-            errors += f", of the variation {metrics['l2_variation']:.2%}"
-        scores = f"CC {number(metrics.get('cc'), 5)}, SSIM {number(metrics.get('ssim'), 4)}"
+            errors += f", of the variation {metrics.l2_variation:.2%}"
+        scores = f"CC {number(metrics.cc, 5)}, SSIM {number(metrics.ssim, 4)}"
         rows.append(("Against the truth", f"{errors}; {scores}"))
     spread = result.volumes.get("density_std", result.volumes.get(f"{field_of(result.volumes)}_std"))
-    if (bootstrap := _bootstrap(result)) and spread is not None:
+    if metrics.uncertainty and spread is not None:
         quantity = spread.quantity.removesuffix("_std")
         rms = float(np.sqrt(np.nanmean(spread.values.double().numpy() ** 2)))
         name, unit = LABELS.get(quantity, (quantity, spread.unit))
-        title = f"Standard deviation, bootstrap of {bootstrap.get('members')}"
+        title = f"Standard deviation, bootstrap of {metrics.uncertainty['trials']}"
         rows.append((title, f"rms {with_unit(number(rms, 2), unit)} of {name}"))
-    coverage = metrics.get("coverage")
-    if isinstance(coverage, dict):
-        flow = coverage.get("share_in_flow")
-        in_flow = "" if flow is None else f", {flow:.0%} of those in the flow"
-        rows.append(("Truth within ±2 σ", f"{coverage['share']:.0%} of the voxels{in_flow}"))
+    if coverage := metrics.coverage:
+        text = f"{coverage['two_sigma']:.0%} of the voxels, {coverage['two_sigma_in_flow']:.0%} of those in the flow"
+        rows.append(("Truth within ±2 σ", text))
     return rows
 
 
 def _scores(views: list[View]) -> str:
     """The worst scores of some views."""
     cc, noise = _extreme(views, "cc", min), _extreme(views, "rms_over_sigma")
-    rms = rms_with_unit(max(views, key=lambda v: v.get("rms") or 0.0), 3)
+    rms = rms_with_unit(max(views, key=lambda v: v["rms"]), 3)
     least, most = ("at least ", "at most ") if len(views) > 1 else ("", "")
     return f"CC {least}{number(cc, 5)}, rms error {most}{rms}{'' if noise is None else f' = {noise:.2f} σ'}"
 
 
-def _extreme(views: list[View], key: str, extreme: Callable[..., float | None] = max) -> float | None:
-    return extreme((float(v[key]) for v in views if v.get(key) is not None), default=None)
+def _extreme(views: Sequence[Any], key: str, extreme: Callable[..., float | None] = max) -> float | None:
+    return extreme((v[key] for v in views if key in v and math.isfinite(v[key])), default=None)
 
 
 def _place(view: View, views: list[View]) -> str:
@@ -157,18 +157,13 @@ def _place(view: View, views: list[View]) -> str:
 
 
 def _views(result: Result, withheld: bool) -> list[View]:
-    views = result.metrics.get("views")
-    return [v for v in views if v.get("withheld") is withheld] if isinstance(views, list) else []
+    return [v for v in result.metrics.views if v["withheld"] is withheld]
 
 
 def cross_validated(result: Result) -> list[View]:
     """Return the scores of the view that was withheld from the first run of a cross-validation."""
-    return list((result.metrics.get("cross_validation") or {}).get("views") or [])
-
-
-def _bootstrap(result: Result) -> dict[str, Any]:
-    trials = result.metrics.get("uncertainty")
-    return trials if isinstance(trials, dict) else {}
+    first_run = result.metrics.cross_validation
+    return list(first_run["views"]) if first_run else []
 
 
 def headline(result: Result) -> Statement:
@@ -177,7 +172,7 @@ def headline(result: Result) -> Statement:
     if gap is not None:
         return Statement("bad", f"Cannot tell: {gap.name} is missing or damaged, see below.")
     judgement = verdict(result)
-    return Statement(LEVEL_OF_WORD[judgement.word], judgement.sentence)
+    return Statement(LEVEL_OF_RATING[judgement.rating], judgement.sentence)
 
 
 def statements(result: Result) -> list[Statement]:
@@ -192,7 +187,7 @@ def statements(result: Result) -> list[Statement]:
 
 
 def _of_outcome(result: Result) -> list[Statement]:
-    outcome, message = result.metrics.get("outcome"), result.metrics.get("message", "")
+    outcome, message = result.metrics.outcome, result.metrics.message or ""
     limit = "The run stopped at its {}; a longer run may reduce the error."
     level, text = {
         "diverged": ("bad", f"The run diverged. {message}"),
@@ -213,7 +208,7 @@ def _of_withheld_views(result: Result) -> list[Statement]:
             text = "No view was withheld, so the field is not validated against independent data. "
             text += "Repeat with --withhold auto, or the name of a view."
         return [Statement("warning", text)]
-    views = [v for v in withheld or first_run if v.get("cc") is not None]
+    views = [v for v in withheld or first_run if math.isfinite(v["cc"])]
     if not views:
         return [Statement("warning", "The withheld views have no valid pixels to compare.")]
     worst = min(views, key=lambda v: v["cc"])
@@ -237,7 +232,7 @@ def _of_residuals(result: Result) -> list[Statement]:
         text = "No training view was compared, so it is unknown whether the residuals are noise. "
         text += "nerif evaluate --measurement FILE compares the views of the reconstruction."
         return [Statement("note", text)] if _views(result, True) else []
-    views = [v for v in training if v.get("rms_over_sigma") is not None]
+    views = [v for v in training if math.isfinite(v.get("rms_over_sigma", math.nan))]
     if not views:
         of_images = any(k.background for k in TECHNIQUES.values() if k.measured == training[0]["measured"])
         remedy = "nerif displacement writes sigma." if of_images else "Give its sigma."
@@ -280,7 +275,7 @@ def _of_correlated_residuals(result: Result) -> list[Statement]:
 
 
 def _of_truth(result: Result) -> list[Statement]:
-    cc, variation = result.metrics.get("cc"), result.metrics.get("l2_variation")
+    cc, variation = result.metrics.cc, result.metrics.l2_variation
     if cc is None or variation is None:
         return []
     level = "good" if cc >= TRUTH_CC[0] else "warning" if cc >= TRUTH_CC[1] else "bad"
@@ -299,14 +294,15 @@ def _of_gas(result: Result) -> list[Statement]:
 
 
 def _of_bootstrap(result: Result) -> list[Statement]:
-    diverged = _bootstrap(result).get("diverged") or []
+    uncertainty = result.metrics.uncertainty
+    diverged = uncertainty["diverged_trials"] if uncertainty else []
     names = ", ".join(map(str, diverged))
     text = f"Bootstrap trials {names} diverged and are excluded from the standard deviations."
     return [Statement("warning", text)] if diverged else []
 
 
 def _of_rig(result: Result) -> list[Statement]:
-    table = result.metrics.get("rig")
+    table = result.metrics.rig
     if not table:
         return []
     first, *lines = refinement_lines(table)

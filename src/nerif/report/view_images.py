@@ -6,7 +6,6 @@ import base64
 import io
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -16,6 +15,7 @@ from nerif.common.conventions import unit_shown
 from nerif.data.measurement import Measurement, Observation
 from nerif.data.reprojection import Reprojection
 from nerif.plotting.drawing import map_colours, map_range
+from nerif.results.metrics import ViewScores
 
 __all__ = ["Scale", "ViewImages", "colour_table", "image_address", "lattice_step", "view_images"]
 
@@ -58,7 +58,7 @@ class ViewImages:
 
     name: str
     withheld: bool
-    scores: list[dict[str, Any]]
+    scores: list[ViewScores]
     rows: dict[str, tuple[str, str, str]]
     size: tuple[int, int]
     bin_size: tuple[int, int]
@@ -77,7 +77,7 @@ def lattice_step(measurement: Measurement, max_pixels: int) -> int:
     return max(1, math.ceil(math.sqrt(views * height * width / max_pixels)))
 
 
-def view_images(reprojection: Reprojection, metrics: list[dict[str, Any]]) -> tuple[list[ViewImages], list[Scale]]:
+def view_images(reprojection: Reprojection, metrics: list[ViewScores]) -> tuple[list[ViewImages], list[Scale]]:
     """Return the images of all views, and the colours of each technique.
 
     The colour range is the 99.8th percentile of the measurement, the 99.5th of the difference, over all views.

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import csv
-import json
 import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, TypeVar
 
 from nerif import __version__
 from nerif.common.conventions import InputError
-from nerif.common.files import atomic, read_toml, write_json, write_toml
+from nerif.common.files import atomic, read_toml, write_toml
 from nerif.common.written_files import WARN, OwnFiles, remove_empty
 from nerif.data.exports import export
 from nerif.data.measurement import Measurement
@@ -29,6 +28,7 @@ from nerif.geometry.symmetry import Symmetry
 from nerif.reconstruction import files as field_files
 from nerif.reconstruction.base import Reconstruction, State
 from nerif.reconstruction.files import CHECKPOINT, FIELD, read_field, read_quantity, read_state
+from nerif.results.metrics import Metrics
 
 __all__ = [
     "CALIBRATION", "FIGURES", "METRICS", "REPORT", "RUN", "VOLUME", "Gap", "Result", "ResultDirectory", "versions",
@@ -73,7 +73,7 @@ class Result:
     directory : its path
     settings : of run.toml; empty if missing
     about : the table [about] of run.toml: versions, outcome
-    metrics : of metrics.json; empty if missing
+    metrics : of metrics.json; all empty if missing
     history : records of history.csv, blanks as NaN
     volumes : by quantity; with error bars also index_excess_std, density_std, ...
     reprojection : measured and predicted views, or None
@@ -85,7 +85,7 @@ class Result:
     directory: Path
     settings: dict[str, Any] = field(default_factory=dict)
     about: dict[str, Any] = field(default_factory=dict)
-    metrics: dict[str, Any] = field(default_factory=dict)
+    metrics: Metrics = field(default_factory=Metrics)
     history: list[dict[str, float]] = field(default_factory=list)
     volumes: dict[str, Volume] = field(default_factory=dict)
     reprojection: Reprojection | None = None
@@ -101,7 +101,7 @@ class Result:
     @property
     def meridian(self) -> Meridian | None:
         """The quantities of a symmetric flow over (r, h); None for other flows."""
-        axis = self.metrics.get("axis") if self.volumes else None
+        axis = self.metrics.axis if self.volumes else None
         return Meridian.of(self.volumes, Symmetry.from_entries(axis["symmetry"])) if axis else None
 
     @property
@@ -189,19 +189,15 @@ class ResultDirectory:
             writer.writeheader()
             writer.writerows(history)
 
-    def write_metrics(self, entries: Mapping[str, Any]) -> None:
-        """Write metrics.json without the entries of an earlier field."""
+    def write_metrics(self, metrics: Metrics) -> None:
+        """Write metrics.json."""
         with self.writing(METRICS) as path:
-            write_json(path, entries)
+            metrics.write(path)
 
-    def add_metrics(self, entries: Mapping[str, Any]) -> None:
-        """Add entries to metrics.json."""
-        path = self.path / METRICS
-        try:
-            present = json.loads(path.read_text()) if path.is_file() else {}
-        except ValueError:
-            raise InputError("not a JSON file, or truncated; remove it and evaluate again", field=path) from None
-        self.write_metrics({**present, **entries})
+    def add_metrics(self, **sections: Any) -> None:
+        """Replace sections of metrics.json, which is made if there is none."""
+        present = self.metrics() if self.has(METRICS) else Metrics()
+        self.write_metrics(replace(present, **sections))
 
     def write_volumes(self, volumes: list[Volume]) -> None:
         """Write volume.nc and volume.vti."""
@@ -238,15 +234,12 @@ class ResultDirectory:
         """Return run.toml with [about]; empty if there is none."""
         return read_toml(self.path / RUN) if self.has(RUN) else {}
 
-    def metrics(self) -> dict[str, Any]:
-        """Return metrics.json, if all of it has the expected form."""
+    def metrics(self) -> Metrics:
+        """Return metrics.json."""
         path = self.path / METRICS
-        try:
-            return _checked(json.loads(path.read_text()))
-        except FileNotFoundError:
-            raise InputError(f"missing; nerif evaluate {self.path} --measurement FILE writes it", field=path) from None
-        except ValueError as error:
-            raise InputError(f"not a JSON file of nerif, or truncated ({error})", field=path) from None
+        if not self.has(METRICS):
+            raise InputError(f"missing; nerif evaluate {self.path} --measurement FILE writes it", field=path)
+        return Metrics.read(path)
 
     def history(self) -> list[dict[str, float]]:
         """Return the records of history.csv, blanks as NaN."""
@@ -306,15 +299,15 @@ class ResultDirectory:
                 return default
 
         run: dict[str, Any] = attempt(RUN, self.settings, {}, "no settings")
-        metrics: dict[str, Any] = attempt(
-            METRICS, self.metrics, {}, "no comparison with the views; nerif evaluate --measurement FILE adds it"
+        metrics = attempt(
+            METRICS, self.metrics, Metrics(), "no comparison with the views; nerif evaluate --measurement FILE adds it"
         )
         history: list[dict[str, float]] = []
         volumes: dict[str, Volume] = {}
         reprojection, measurement = None, None
         if views:
             history = attempt(HISTORY, self.history, history, "no convergence curves")
-        if views or "uncertainty" in metrics:
+        if views or metrics.uncertainty:
             volumes = attempt(VOLUME, self.volumes, volumes, "no field to show; nerif export writes it")
         if views:
             reprojection = attempt(
@@ -340,12 +333,12 @@ class ResultDirectory:
             missing=tuple(gaps),
         )
 
-    def _truth(self, metrics: dict[str, Any], volumes: dict[str, Volume], gaps: list[Gap]) -> Volume | None:
+    def _truth(self, metrics: Metrics, volumes: dict[str, Volume], gaps: list[Gap]) -> Volume | None:
         """The truth of an evaluation, at its path or, if both were moved, beside the result."""
-        path = metrics.get("truth")
-        if not isinstance(path, str):
+        if metrics.truth is None:
             return None
-        places = (Path(path), self.path / Path(path).name, self.path.parent / Path(path).name)
+        path = Path(metrics.truth)
+        places = (path, self.path / path.name, self.path.parent / path.name)
         try:
             quantity = field_of(volumes)
             path = next((p for p in places if p.is_file()), places[0])
@@ -387,24 +380,6 @@ def _measurement(run: dict[str, Any]) -> Measurement | None:
         return Measurement.read(str(run["measurement"]))
     except (InputError, KeyError):
         return None
-
-
-def _checked(metrics: Any) -> dict[str, Any]:
-    """The metrics, with the quantity of older files, which had displacements only."""
-    if not isinstance(metrics, dict):
-        raise ValueError("expected a table of names and values")
-    for name, key in (("views", "name"), ("slices", "z_mm")):
-        rows = metrics.get(name, [])
-        if not isinstance(rows, list) or not all(isinstance(row, dict) and key in row for row in rows):
-            raise ValueError(f"'{name}' is not a list of tables with '{key}'")
-    for name, key in (("uncertainty", "members"), ("coverage", "share"), ("cross_validation", "views")):
-        table = metrics.get(name, {key: 0})
-        if not isinstance(table, dict) or key not in table:
-            raise ValueError(f"'{name}' is not a table with '{key}'")
-    for row in (*metrics.get("views", []), *(metrics.get("cross_validation", {}).get("views") or [])):
-        for key, value in (("measured", "displacement"), ("unit", "px"), ("rms", row.get("rms_px"))):
-            row.setdefault(key, value)
-    return metrics
 
 
 def _number(text: str | None) -> float:

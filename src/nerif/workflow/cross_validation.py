@@ -6,7 +6,6 @@ import json
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from nerif.analysis.asymmetry import HALVES, withhold_half
 from nerif.analysis.evaluation import evaluate_views, rms_with_unit
@@ -20,6 +19,7 @@ from nerif.reconstruction.shared_settings import SharedSettings
 from nerif.reconstruction.symmetry import axis_of, check_views, with_axis
 from nerif.reconstruction.uncertainty.bootstrap import best_covered
 from nerif.results.directory import ResultDirectory
+from nerif.results.metrics import WithheldRun
 from nerif.workflow.checkpointed import CheckpointedRun
 
 __all__ = ["AUTO", "MIN_VIEWS", "NONE", "CrossValidation", "with_halves", "withheld_views"]
@@ -120,10 +120,10 @@ class CrossValidation:
             say(f"cross-validation: withheld view {name} predicted with CC {v['cc']:.4f}, rms error {rms_with_unit(v)}")
         return result
 
-    def scores(self) -> dict[str, Any]:
-        """Return prediction errors and duration, empty if there are none yet."""
+    def scores(self) -> WithheldRun | None:
+        """Return prediction errors and duration, None if there are none yet."""
         path = self._directory / SCORES
-        return json.loads(path.read_text()) if path.is_file() else {}
+        return json.loads(path.read_text()) if path.is_file() else None
 
     @property
     def _directory(self) -> ResultDirectory:

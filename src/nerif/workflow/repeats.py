@@ -86,10 +86,10 @@ class Members:
         volumes.append(certainty(volumes[0], std))
         self.out.write_volumes(volumes)
         entries: dict[str, Any] = {
-            "kind": self.trials.kind, "members": deviations.count, "diverged": diverged,
+            "kind": self.trials.kind, "trials": deviations.count, "diverged_trials": diverged,
             "seconds": time.monotonic() - start,
         }  # fmt: skip
-        self.out.add_metrics({word: entries})
+        self.out.add_metrics(uncertainty=entries)
         for line in masked_lines(volumes):
             say(line)
         rms, largest = float(std.values.square().mean().sqrt()), float(volumes[0].values.abs().max())

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import asdict, replace
-from typing import Any, ClassVar
+from typing import ClassVar
 
 from nerif.analysis.asymmetry import asymmetry, asymmetry_sentence
 from nerif.analysis.evaluation import evaluate_views, score_lines
@@ -25,6 +25,7 @@ from nerif.reconstruction.rig.parameters import refinement_lines, with_correctio
 from nerif.reconstruction.rig.posterior import with_posterior
 from nerif.reconstruction.rig.refinement import refit
 from nerif.results.directory import CALIBRATION, versions
+from nerif.results.metrics import Metrics
 from nerif.workflow.job import Job
 from nerif.workflow.repeats import Members, all_quantities
 from nerif.workflow.reports import write_report
@@ -113,11 +114,14 @@ class WriteField(PipelineStep):
         temperature = "temperature" in quantities_of(job.measurement.quantity)
         if temperature and all(v.quantity != "temperature" for v in volumes):
             say(f"temperature: not computed: {NOT_UNIFORM}")
-        scores = {} if job.validation is None else job.validation.scores()
-        metrics: dict[str, Any] = {"cross_validation": scores} if scores else {}
-        metrics |= {name: getattr(result, name) for name in ("seconds", "peak_memory_bytes", "device")}
-        metrics |= {"outcome": result.outcome.reason, "message": result.outcome.message}
-        out.write_metrics({**metrics, "measurement": job.settings["measurement"]})
+        out.write_metrics(  # without the sections of an earlier field
+            Metrics(
+                measurement=job.settings["measurement"], seconds=result.seconds, device=result.device,
+                peak_memory_bytes=result.peak_memory_bytes, outcome=result.outcome.reason,
+                message=result.outcome.message,
+                cross_validation=None if job.validation is None else job.validation.scores(),
+            )
+        )  # fmt: skip
         about = {**versions(), "outcome": result.outcome.reason, "seconds": round(result.seconds, 3)}
         out.write_settings(job.settings, about | ({"gains": job.inputs.gains} if job.inputs.gains else {}))
 
@@ -125,7 +129,7 @@ class WriteField(PipelineStep):
 class WriteRig(PipelineStep):
     """Write the refined calibration with its uncertainty; predictions use it from here on."""
 
-    sections = ("rig", "rig_withheld", "views_refitted")
+    sections = ("rig", "withheld_rig", "withheld_views")
 
     @staticmethod
     def wanted(job: Job) -> bool:
@@ -138,7 +142,7 @@ class WriteRig(PipelineStep):
             training = measurement.without(job.withheld)
             rig = with_posterior(result.rig, training, result.field, result.settings, bar)
         job.measurement = with_corrections(measurement, rig)
-        out.add_metrics({"rig": rig})
+        out.add_metrics(rig=rig)
         with out.writing(CALIBRATION) as path:
             write_cameras(path, [CalibratedCamera.from_camera(c) for c in job.measurement.cameras])
         for line in refinement_lines(rig):
@@ -150,7 +154,7 @@ class WriteRig(PipelineStep):
             table = refit(result.field, withheld, result.settings, result.device)
             refitted = reproject(result.field, with_corrections(withheld, table), job.withheld, result.device)
         views = evaluate_views(refitted) if table else []
-        out.add_metrics({"rig_withheld": table, "views_refitted": views})
+        out.add_metrics(withheld_rig=table, withheld_views=views)
         for line in score_lines(views):
             monitor.say(f"{line}, its camera refined against the field")
 
@@ -167,7 +171,7 @@ class Reproject(PipelineStep):
             reprojection = reproject(result.field, job.measurement, job.withheld, result.device, bar, result.model)
         with monitor.counting("scoring the views"):
             views = evaluate_views(reprojection)
-            out.add_metrics({"views": views, "reprojection": [a.entries for a in reprojection.accuracies]})
+            out.add_metrics(views=views, reprojection=[a.entries for a in reprojection.accuracies])
             out.write_reprojection(reprojection)
         for line in (*score_lines(views), *(accuracy.sentence for accuracy in reprojection.accuracies)):
             monitor.say(line)
@@ -188,9 +192,9 @@ class WriteAxis(PipelineStep):
     def run(job: Job) -> None:
         axis = the_result(job).axis
         assert axis is not None
-        departures = asymmetry(job.inputs.all_views, axis.symmetry) if axis.symmetry.axial else []
-        job.out.add_metrics({"axis": axis.record, "asymmetry": departures})
-        for line in (*axis.sentences, *(asymmetry_sentence(d) for d in departures)):
+        halves = asymmetry(job.inputs.all_views, axis.symmetry) if axis.symmetry.axial else []
+        job.out.add_metrics(axis=axis.record, asymmetry=halves)
+        for line in (*axis.sentences, *(asymmetry_sentence(d) for d in halves)):
             job.monitor.say(line)
 
 
@@ -234,7 +238,7 @@ class Judge(PipelineStep):
         if (meridian := result.meridian) is not None:
             job.out.write_meridian(meridian)
         assessment = verdict(result)
-        job.out.add_metrics({"verdict": asdict(assessment)})
+        job.out.add_metrics(verdict=asdict(assessment))
         job.monitor.say(assessment.sentence)
 
 

@@ -78,12 +78,12 @@ def run(settings: Check) -> Consistency | RigCheck:
 def _rig(settings: Check, measurement: Measurement) -> RigCheck:
     sigma = (settings.pose_sigma_mm, settings.pose_sigma_deg)
     result = check_rig(measurement, settings.refine, settings.time_limit, *sigma, MONITOR, settings.aperture)
-    heads = ("change [sigma]", "shift [px]", "+- [px]", "constrained", "residual [sigma]")
+    heads = ("change [sigma]", "shift [px]", "+- [px]", "less uncertain", "residual [sigma]")
     say(f"{'view':<14}" + "".join(f"{head:>18}" for head in heads))
     for row in result.table:
         residual = f"{row['rms_before']:.2f} -> {row['rms_after']:.2f}" if "rms_after" in row else "unknown"
-        shift = (f"{row['aside_px']:.3f}", f"{row['aside_sigma_px']:.3f}")
-        cells = (f"{row['moved']:.1f}", *shift, f"{row['constrained']:.0%}", residual)
+        shift = (f"{row['image_shift_px']:.3f}", f"{row['image_shift_sigma_px']:.3f}")
+        cells = (f"{row['correction_over_sigma']:.1f}", *shift, f"{row['uncertainty_reduction']:.0%}", residual)
         say(f"{row['name']:<14}" + "".join(f"{cell:>18}" for cell in cells))
     return result
 

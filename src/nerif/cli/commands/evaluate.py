@@ -14,6 +14,7 @@ from nerif.cli.commands.output import counting_bar, say
 from nerif.cli.commands.settings import Settings, command
 from nerif.common.conventions import InputError
 from nerif.data.volume import INDEX, name_of
+from nerif.results.metrics import ViewScores
 
 __all__ = ["Evaluate", "main", "run"]
 
@@ -51,9 +52,9 @@ def run(settings: Evaluate) -> dict[str, Any]:
 
 def _print_volume(metrics: dict[str, Any]) -> None:
     if "coverage" in metrics:
-        share = metrics["coverage"]
-        one, two = share["share_in_one_in_flow"], share["share_in_flow"]
-        say(f"truth within 2 standard deviations in {share['share']:.1%} of the voxels; where the field exceeds")
+        coverage = metrics["coverage"]
+        one, two = coverage["one_sigma_in_flow"], coverage["two_sigma_in_flow"]
+        say(f"truth within 2 standard deviations in {coverage['two_sigma']:.1%} of the voxels; where the field exceeds")
         say(f"  {FLOW:.0%} of its maximum: within 2 in {two:.1%} (nominal 95 %), within 1 in {one:.1%} (nominal 68 %)")
     if metrics["quantity"] == INDEX:
         say(f"L2            {metrics['l2']:8.3%}   |n_gt - n_rec| / |n_gt - 1|, as in the paper")
@@ -62,7 +63,7 @@ def _print_volume(metrics: dict[str, Any]) -> None:
         say(f"L2            {metrics['l2']:8.3%}   |f_gt - f_rec| / |f_gt| of the {name_of(metrics['quantity'])} f")
     if "aligned" in metrics:
         shift = math.hypot(*metrics["aligned"]["shift_mm"])
-        rotation = math.degrees(math.hypot(*metrics["aligned"]["turn_rad"]))
+        rotation = math.degrees(math.hypot(*metrics["aligned"]["rotation_rad"]))
         motion = f"after a rigid motion of {shift:.3f} mm and {rotation:.3f} degrees"
         say(f"L2 aligned    {metrics['aligned']['l2']:8.3%}   {motion}")
     say(f"CC            {metrics['cc']:8.5f}")
@@ -73,7 +74,7 @@ def _print_volume(metrics: dict[str, Any]) -> None:
         say(f"{s['z_mm']:9.2f} {s['cc']:7.4f} {s['ssim']:7.4f} {s['psnr']:11.2f}")
 
 
-def _print_views(views: list[dict[str, Any]]) -> None:
+def _print_views(views: list[ViewScores]) -> None:
     several = len({v["measured"] for v in views}) > 1
     say(f"view          {' ' * 14 * several}      CC    SSIM  PSNR [dB]  rms")
     for v in views:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -127,10 +127,10 @@ def _result(path: Path) -> None:
         say(f"  {METRICS} is missing; the run is not complete")
         return
     metrics = directory.metrics()
-    for name, value in metrics.items():
-        if not isinstance(value, list | dict):
+    for name, value in asdict(metrics).items():
+        if value is not None and not isinstance(value, list | dict):
             say(f"  {name:<18} {value}")
-    for v in metrics.get("views", []):
+    for v in metrics.views:
         use = "withheld" if v["withheld"] else "training"
         say(f"  view {v['name']:<14} {use}  CC {number(v['cc'], 5)}  rms {v['measured']} error {rms_with_unit(v)}")
 

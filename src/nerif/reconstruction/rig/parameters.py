@@ -5,18 +5,22 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NotRequired
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from typing_extensions import TypedDict
 
 from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
 from nerif.geometry import Camera
 from nerif.geometry.pose import GEOMETRY, Corrections
 
-__all__ = ["GROUPS", "MOVED", "NAMES", "check_refined", "displaced", "prior", "refinement_lines", "with_corrections"]
+__all__ = [
+    "GROUPS", "MOVED", "NAMES", "RefinedView", "check_refined", "displaced", "prior", "refinement_lines",
+    "with_corrections",
+]  # fmt: skip
 
 IMAGE = ("u", "v", "u_x", "u_y", "v_x", "v_y")
 """Displacement of a whole image, px: constant, and growing from the middle to the edge along columns and rows."""
@@ -32,6 +36,26 @@ MOVED = 3.0  # sigma: a larger correction is significant
 ROUNDING = 1e-6  # sigma
 FEW_VIEWS = 3  # to which a field can be fitted for nearly any poses
 UNCONSTRAINED = 0.3  # share of the prior uncertainty that the data remove (posterior.py), below which they say little
+
+
+class RefinedView(TypedDict):
+    """Estimates of the parameters of a view, by their names, in UNITS."""
+
+    name: str
+    values: dict[str, float]
+    prior_sigma: dict[str, float]
+    correction_over_sigma: float
+    """Size of image_shift_px or, if larger, of the largest parameter."""
+    image_shift_px: float
+    """Shift of the middle of the box in the image."""
+    posterior_sigma: NotRequired[dict[str, float]]
+    image_shift_sigma_px: NotRequired[float]
+    """Posterior standard deviation in the worse direction."""
+    uncertainty_reduction: NotRequired[float]
+    """1 minus posterior over prior uncertainty of that shift."""
+    rms_before: NotRequired[float]
+    rms_after: NotRequired[float]
+    """Residual over sigma as calibrated and as refined, with the same field."""
 
 
 def refined_groups(refine: Sequence[str]) -> tuple[str, ...]:
@@ -73,7 +97,7 @@ def prior(camera: Camera, mm: float | None, deg: float | None, px: float) -> Flo
     return torch.cat([sigma, torch.tensor(rest, dtype=torch.float64)])
 
 
-def with_corrections(measurement: Measurement, table: Sequence[dict[str, Any]]) -> Measurement:
+def with_corrections(measurement: Measurement, table: Sequence[RefinedView]) -> Measurement:
     """Return a measurement with the refined cameras of a `Refinement.table`, and without the shifts of its images.
 
     Views that are not in the table are unchanged.
@@ -81,11 +105,11 @@ def with_corrections(measurement: Measurement, table: Sequence[dict[str, Any]]) 
     if not table:
         return measurement
     _check_table(table)
-    rows = {row["name"]: row for row in table}
+    rows: dict[str, Any] = {row["name"]: row for row in table}
     estimates = [rows.get(name, {}).get("values", {}) for name in measurement.names]
     values = torch.tensor([[row.get(name, 0.0) for name in NAMES] for row in estimates], dtype=torch.float64)
     cameras = Corrections(measurement.cameras, values[:, : len(GEOMETRY)]).corrected
-    cameras = tuple(_with_sigma(camera, rows.get(camera.name, {}).get("sigma_after", {})) for camera in cameras)
+    cameras = tuple(_with_sigma(camera, rows.get(camera.name, {}).get("posterior_sigma", {})) for camera in cameras)
     d = measurement.displacement
     if d is not None and bool(values[:, len(GEOMETRY) :].any()):
         d = d.clone()
@@ -120,26 +144,27 @@ def _check_table(table: Any) -> None:
             )
 
 
-def refinement_lines(table: Sequence[dict[str, Any]]) -> list[str]:
+def refinement_lines(table: Sequence[RefinedView]) -> list[str]:
     """Return a summary of a refinement, and a line for each view with a significant correction."""
-    most = max(table, key=lambda row: row["moved"])
-    lines = [f"refined {len(table)} views; largest correction: {most['name']}, {most['moved']:.1f} sigma"]
-    if most["moved"] < ROUNDING:
+    most = max(table, key=lambda row: row["correction_over_sigma"])
+    size = most["correction_over_sigma"]
+    lines = [f"refined {len(table)} views; largest correction: {most['name']}, {size:.1f} sigma"]
+    if size < ROUNDING:
         lines = [f"refined {len(table)} views: pose errors are not significant; cameras unchanged"]
     if len(table) <= FEW_VIEWS:
         lines.append(f"with {len(table)} views the field can be fitted for nearly any poses; corrections are uncertain")
-    weak = [row["name"] for row in table if row.get("constrained", 1.0) < UNCONSTRAINED]
+    weak = [row["name"] for row in table if row.get("uncertainty_reduction", 1.0) < UNCONSTRAINED]
     if weak:
         views = "any view" if len(weak) == len(table) else ", ".join(weak)
         lines.append(
             f"the data do not constrain the pose of {views}, since the field can adapt or the noise is too large; "
             "it stays as calibrated"
         )
-    for row in (row for row in table if row["moved"] > MOVED):
-        number, value = max(row["values"].items(), key=lambda n: abs(n[1]) / max(row["sigma"][n[0]], 1e-30))
+    for row in (row for row in table if row["correction_over_sigma"] > MOVED):
+        number, value = max(row["values"].items(), key=lambda n: abs(n[1]) / max(row["prior_sigma"][n[0]], 1e-30))
         lines.append(
             f"view {row['name']} is not where its calibration says: {number} {value:.3g} {UNITS[NAMES.index(number)]}, "
-            f"{row['moved']:.1f} sigma, {row.get('aside_px', 0.0):.2g} px in the image; calibrate it again, or state a "
-            "larger pose_sigma"
+            f"{row['correction_over_sigma']:.1f} sigma, {row['image_shift_px']:.2g} px in the image; calibrate it "
+            "again, or state a larger pose_sigma"
         )
     return lines

@@ -25,6 +25,7 @@ from nerif.fields.grid import Boundary
 from nerif.forward.path_integral import PathIntegral, project
 from nerif.geometry import Grid, Rays
 from nerif.reconstruction.gauge import ambient_faces
+from nerif.reconstruction.rig.parameters import RefinedView
 from nerif.reconstruction.rig.refinement import Refinement, random_pixels
 from nerif.reconstruction.sources import of_source
 from nerif.reconstruction.target import Part, Target
@@ -45,15 +46,12 @@ Progress = Callable[[int, int], None]
 
 
 def with_posterior(
-    table: Sequence[dict[str, Any]], measurement: Measurement, field: Field, settings: Mapping[str, Any],
+    table: Sequence[RefinedView], measurement: Measurement, field: Field, settings: Mapping[str, Any],
     on_voxel: Progress = lambda done, total: None,
-) -> list[dict[str, Any]]:  # fmt: skip
+) -> list[RefinedView]:  # fmt: skip
     """Return a table of refined parameters with their posterior standard deviations and the residuals of each view.
 
-    `sigma_after` are these deviations; `aside_sigma_px` that of the middle of the box in the image, in the worse
-    direction; `constrained` is 1 minus the posterior share of its prior uncertainty; `rms_before` and `rms_after` are
-    the residuals over sigma as calibrated and as refined, both with the given field. Rows of views that are not in the
-    measurement or have no displacements are unchanged.
+    Rows of views that are not in the measurement or have no displacements are unchanged.
 
     Parameters
     ----------
@@ -69,22 +67,22 @@ def with_posterior(
     rig.values = torch.zeros_like(rig.values)
     before = residuals(rig, measurement, field, faces)
     sigma_known = all(o.sigma is not None for o in measurement.observations)
-    k, rows = len(rig.columns), list[dict[str, Any]]()
+    k, rows = len(rig.columns), list[RefinedView]()
     for row in table:
         if row["name"] not in rig.names:
             rows.append(row)
             continue
         v = rig.names.index(row["name"])
         block, sigma = posterior[v * k : (v + 1) * k, v * k : (v + 1) * k], rig.sigma[v, rig.columns]
-        sigma_after = (block.diagonal().clamp(min=0).sqrt() * sigma).tolist()
+        posterior_sigma = (block.diagonal().clamp(min=0).sqrt() * sigma).tolist()
         slopes = rig.aside(v) * sigma  # px per sigma of each parameter
         after_px, before_px = slopes @ block @ slopes.T, slopes @ slopes.T
         share = torch.linalg.eigvals(torch.linalg.pinv(before_px, hermitian=True) @ after_px).real.max()
         row = {
             **row,
-            "constrained": 1 - float(share.clamp(0, 1).sqrt()),
-            "aside_sigma_px": float(torch.linalg.eigvalsh(after_px)[-1].clamp(min=0).sqrt()),
-            "sigma_after": dict(zip(row["values"], sigma_after, strict=True)),
+            "uncertainty_reduction": 1 - float(share.clamp(0, 1).sqrt()),
+            "image_shift_sigma_px": float(torch.linalg.eigvalsh(after_px)[-1].clamp(min=0).sqrt()),
+            "posterior_sigma": dict(zip(row["values"], posterior_sigma, strict=True)),
         }
         rows.append({**row, "rms_before": float(before[v]), "rms_after": float(after[v])} if sigma_known else row)
     return rows

@@ -29,7 +29,7 @@ from nerif.fields.base import Field
 from nerif.forward.path_integral import PathIntegral, project
 from nerif.geometry import Box, Camera, Rays
 from nerif.geometry.pose import GEOMETRY, Corrections
-from nerif.reconstruction.rig.parameters import GROUPS, NAMES, displaced, prior, refined_groups
+from nerif.reconstruction.rig.parameters import GROUPS, NAMES, RefinedView, displaced, prior, refined_groups
 from nerif.reconstruction.sources import of_source
 from nerif.reconstruction.target import Part, Target
 
@@ -99,7 +99,7 @@ class Refinement:
 
     @classmethod
     def of_table(
-        cls, measurement: Measurement, settings: Mapping[str, Any], table: Sequence[dict[str, Any]], gauged: bool = True
+        cls, measurement: Measurement, settings: Mapping[str, Any], table: Sequence[RefinedView], gauged: bool = True
     ) -> Refinement:
         """Return the refinement of settings with the values of a table, of these and possibly other views."""
         sigma = (settings["pose_sigma_mm"], settings["pose_sigma_deg"], settings["shift_sigma_px"])
@@ -144,20 +144,24 @@ class Refinement:
         corrected = self._corrections.apply(rays, self.box) if geometric else rays
         return replace(part, rays=replace(corrected, view=part.rays.view), offset=self._offset(self.values, rays))
 
-    def table(self) -> list[dict[str, Any]]:
-        """Return a row for each view: `values` and `sigma` by name, `aside_px`, the shift of the middle of the box in
-        its image, and `moved`, the size in sigma of that shift or, if larger, of the largest parameter.
-        """
-        rows = []
+    def table(self) -> list[RefinedView]:
+        """Return the estimates of every view."""
+        rows = list[RefinedView]()
         for v, (camera, corrected) in enumerate(zip(self.cameras, self.corrected, strict=True)):
             value, sigma = self.values[v], self.sigma[v]
             shift = self._middle_in(corrected) - self._middle_in(camera) + value[len(GEOMETRY) :][:2]
             slopes = self.aside(v) * sigma[self.columns]
             size = float((shift @ torch.linalg.pinv(slopes @ slopes.T, hermitian=True) @ shift).clamp(min=0).sqrt())
             most = max((abs(float(value[i] / sigma[i])) for i in self.columns if sigma[i] > 0), default=0.0)
-            row = {"name": camera.name, "moved": max(most, size), "aside_px": float(shift.norm())}
-            values = {NAMES[i]: float(value[i]) for i in self.columns}
-            rows.append({**row, "values": values, "sigma": {NAMES[i]: float(sigma[i]) for i in self.columns}})
+            rows.append(
+                {
+                    "name": camera.name,
+                    "correction_over_sigma": max(most, size),
+                    "image_shift_px": float(shift.norm()),
+                    "values": {NAMES[i]: float(value[i]) for i in self.columns},
+                    "prior_sigma": {NAMES[i]: float(sigma[i]) for i in self.columns},
+                }
+            )
         return rows
 
     def aside(self, view: int) -> Float[Tensor, "2 k"]:
@@ -365,7 +369,7 @@ def load_rig(rig: Refinement | None, tensors: Mapping[str, Tensor]) -> None:
 def refit(
     field: Field, measurement: Measurement, settings: Mapping[str, Any], device: torch.device | str = "cpu",
     steps: int = REFIT_STEPS, per_view: int = REFIT_PIXELS,
-) -> list[dict[str, Any]]:  # fmt: skip
+) -> list[RefinedView]:  # fmt: skip
     """Return the table of the refined parameters of views, such as withheld ones, against a fixed field.
 
     It is empty for images without displacements, whose brightness is unknown. Each of the Gauss-Newton steps uses
