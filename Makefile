@@ -27,7 +27,7 @@ short-tests: .venv/.dev
 	$(PYTEST) -m "not slow"
 
 all-tests: .venv/.dev
-	$(PYTEST)
+	NERIF_CHECK_SHAPES=1 $(PYTEST)
 
 lint: .venv/.dev
 	$(BIN)/ruff check .

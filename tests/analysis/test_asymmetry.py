@@ -84,6 +84,7 @@ def test_halves_of_symmetric_flows_only_are_withheld():
     assert withhold_half(renamed, ("left",), None) == (renamed, ("left",))
 
 
+@pytest.mark.slow
 def test_a_withheld_half_is_predicted_and_evaluated_again(jet_file, capsys):
     out = jet_file.parent / "r"
     metrics = reconstruct(jet_file, out, "--withhold", "left")
@@ -105,6 +106,7 @@ def test_a_half_is_withheld_for_cross_validation(jet_file):
     assert metrics["axis"]["constrained"] == {"shift_1": True, "shift_2": False, "lean_1": True, "lean_2": False}
 
 
+@pytest.mark.slow
 def test_a_cross_validation_that_is_stopped_shows_its_halves(tmp_path):
     out = ResultDirectory(tmp_path / "r")
     settings = Tikhonov(voxels=12, regularisation=0.01, symmetry="axis", device="cpu")

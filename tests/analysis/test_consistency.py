@@ -249,6 +249,7 @@ def test_mistakes_are_corrected(clean, tmp_path, capsys, name):
     assert not (tmp_path / "again.nc").exists()
 
 
+@pytest.mark.slow
 def test_the_command_names_the_view(clean, tmp_path, capsys):
     path = tmp_path / "m.nc"
     spoilt(clean.select(clean.names[::2]), in_view(1, lambda d: -d)).write(path)
@@ -395,6 +396,7 @@ def test_rigs_of_files_are_not_unrelated():
             assert "unrelated" not in codes, path
 
 
+@pytest.mark.slow
 def test_a_view_that_looks_past_the_box_does_not_end_the_check(small, tmp_path, capsys):
     camera = small.cameras[3]
     away = camera.rotation.new_tensor([1.0, -1.0, -1.0])

@@ -47,6 +47,7 @@ def ended(jobs: Jobs, id: str) -> str:
     return state
 
 
+@pytest.mark.slow
 def test_the_app_runs_nothing_of_a_folder_and_its_users_run_nonetheless(tmp_path):
     plant(tmp_path)
     jobs = Jobs(tmp_path)

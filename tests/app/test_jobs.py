@@ -46,6 +46,7 @@ def test_a_run_is_done_and_its_words_are_kept(tmp_path):
         jobs.get(first.id)
 
 
+@pytest.mark.slow
 def test_one_at_a_time_and_in_order(tmp_path):
     jobs = Jobs(tmp_path)
     jobs.advance()
@@ -142,6 +143,7 @@ def test_a_run_outlives_the_server(tmp_path):
     assert until(Jobs(tmp_path), done.stdout.strip(), "done").code == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("last", ["subprocess.Popen", "json.dumps"])  # of a start: before and after the claim
 def test_a_server_killed_while_it_starts_a_run_leaves_it_to_the_next(tmp_path, last):
     code = "import json, os, subprocess, sys; from nerif.app.jobs import Jobs; from pathlib import Path;"

@@ -142,6 +142,7 @@ def images(driver: Any) -> list[str]:
     return list(driver.execute_script("return [...document.querySelectorAll('.cuts img[src]')].map(e => e.src)"))
 
 
+@pytest.mark.slow
 @needs_browser
 def test_two_results_side_by_side_move_together(browser, server):
     from selenium.webdriver.common.keys import Keys

@@ -99,6 +99,7 @@ def test_evaluate(work, capsys):
     assert metrics["l2"] == pytest.approx(float(error / (truth.values.double() + n_ambient - 1).norm()), rel=1e-4)
 
 
+@pytest.mark.slow
 def test_a_collapsed_run_is_reported_and_exits_with_1(work, tmp_path, capsys):
     words = ["reconstruct", work / "m.nc", "-o", tmp_path / "r", *QUICK, "--learning-rate", "1e4"]
     assert run(*words, "--max-steps", "55", "--points-per-batch", "200") == 1
@@ -208,6 +209,7 @@ def test_resume_continues_with_other_limits(work, result):
     assert not torch.equal(before, read_field(result)[0](torch.zeros(1, 3)))
 
 
+@pytest.mark.slow
 def test_ctrl_c_leaves_a_result_to_resume(work, tmp_path):
     out = tmp_path / "r"
     words = ["reconstruct", work / "m.nc", "-o", out, "--no-report", "--withhold", "none", *QUICK]

@@ -174,6 +174,7 @@ def test_calibration_of_other_views_or_sizes(copy, refusal):
     assert "(192, 224)" in refusal(*displacement(copy, "--force"))
 
 
+@pytest.mark.slow
 def test_masks_by_threshold_and_drawn(experiment, tmp_path, capsys, refusal):
     words = ["mask", experiment / "m.nc", "-o"]
     assert run(*words, tmp_path / "masked.nc", "--threshold", "3") == 0

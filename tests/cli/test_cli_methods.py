@@ -86,6 +86,7 @@ def test_penalty_basis_model_and_bounds_are_options(work, tmp_path):
     assert float(field.coefficients[1:-1, 1:-1, 1:-1].max()) <= 0
 
 
+@pytest.mark.slow
 def test_networks_and_voxels_start_from_each_other(work, tmp_path):
     small = str.split("--network.depth 2 --network.width 24 --network.octaves 2 --max-steps 5 --samples 12 16")
     small += str.split("--sample-jitter 2 --points-per-batch 600 --voxels 12 --device cpu --precision float32")

@@ -130,6 +130,7 @@ def test_complete_trials_are_not_repeated(path, tmp_path):
     assert [p.stat().st_mtime_ns != stamp for p, stamp in stamps.items()] == [False, True]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("diverged", ["trial", "main run"])
 def test_diverged_runs(path, tmp_path, capsys, monkeypatch, diverged):
     calls, solve = [], Tikhonov.__call__

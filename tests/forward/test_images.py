@@ -287,6 +287,7 @@ def test_data_of_other_techniques_are_unchanged(balls, taken, d):
     assert of_source(replace(taken, displacement=d), "displacements").names == whole.names[:3]
 
 
+@pytest.mark.slow
 def test_a_run_from_images_resumes_bit_for_bit(taken):
     settings, states = replace(NETWORK, max_steps=40, network=NetworkShape(depth=2, width=16)), {}
 

@@ -144,6 +144,7 @@ def test_files_name_their_field(absorption, both, tmp_path, capsys):
     assert Volume.of(torch.zeros(grid.shape), grid, INDEX, 1.00027).n_ambient == 1.00027
 
 
+@pytest.mark.slow
 def test_notebooks_show_each_technique(both, absorption):
     combined, alone = (Measurement.read(p.with_suffix(".nc"))._repr_html_() for p in (both, absorption))
     assert "Displacement u and v of each view, in px" in combined

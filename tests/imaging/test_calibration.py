@@ -112,6 +112,7 @@ def test_centres_distortion_and_backgrounds_of_perspective_cameras_come_back(exa
         assert abs(plane.offset - camera.plane.offset) < 0.01
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_errors_are_about_their_standard_deviations(noisy, kind):
     """Without the depth of a telecentric camera: 700 mm that no image constrains."""
@@ -240,6 +241,7 @@ def test_a_wrong_pitch_shows_in_the_size_of_the_rig_only():
     assert reach == pytest.approx(2 * float(CAMERAS[0].centre.norm()), rel=1e-3)
 
 
+@pytest.mark.slow
 def test_a_wrong_number_of_squares_and_a_large_error_are_refused():
     with refused("view '100deg'"):
         calibrate(relabelled(CalibrationTarget("charuco", 8, 8, pitch=12.0)), SETTINGS["perspective"])

@@ -200,6 +200,7 @@ def remove(path: Path) -> None:
     shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize("kind", OUTCOMES)
 def test_mutants_are_refused_in_one_line_or_give_a_finite_field(good, kind, tmp_path, capfd):

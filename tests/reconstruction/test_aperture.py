@@ -67,6 +67,7 @@ def test_the_path_integral_through_a_lens_agrees_with_curved_rays(wide):
     assert float((exact - predicted(wide, camera)).std()) < 0.005 * float(exact.std())
 
 
+@pytest.mark.slow
 def test_a_displacement_over_a_window_is_the_mean_over_its_pixels(wide):
     edge = 3
     camera = replace(wide.cameras[1], lens=Lens(window=float(edge)))
@@ -214,6 +215,7 @@ def test_the_lens_reduces_the_error(wide):
     assert errors[0] < 0.95 * errors[1]
 
 
+@pytest.mark.slow
 def test_a_run_through_lenses_resumes_exactly(wide):
     settings = NeRIF(max_steps=20, points_per_batch=1024, device="cpu", lens_rays=6)
     points = torch.rand(30, 3, generator=torch.Generator().manual_seed(0)) * 40 - 20

@@ -69,6 +69,7 @@ def test_a_run_converges_and_resumes(measurement, ball, tmp_path, monkeypatch):
     assert torch.equal(finished.field(points), whole.field(points))
 
 
+@pytest.mark.slow
 def test_the_longest_time_ends_a_run_and_more_time_continues_it(measurement):
     short = replace(ENDLESS, longest=0.5, first_cycle=10**6)(measurement)
     assert short.outcome.reason == "time_limit"

@@ -204,6 +204,7 @@ def test_short_computations_share_the_measurements_of_an_outer_context(machine):
     assert machine.threads_after(9.0, 0.0, 1.0) == 2  # nothing is measured outside of it
 
 
+@pytest.mark.slow
 def test_the_counters_of_this_machine_and_the_threads_of_numba():
     first, later = threads._used(), threads._used()
     assert first is not None

@@ -155,6 +155,7 @@ def test_a_run_from_images(measurement, gpu):
     assert not gpu.rounded
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["fast", "paper"])
 def test_a_step_waits_for_nothing(measurement, gpu, name):
     counts = []

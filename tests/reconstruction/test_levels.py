@@ -66,6 +66,7 @@ def test_a_view_without_a_whole_bin_keeps_its_pixels(flame):
     assert torch.allclose(rays.direction, pixels.direction)
 
 
+@pytest.mark.slow
 def test_coarse_grids_and_bins_change_the_path_and_not_the_end(flame):
     method = Tikhonov(voxels=16, device="cpu", regularisation=1e-3, tolerance=1e-6, iterations=100)
     coarse, fine = method(flame), replace(method, coarse_to_fine=False)(flame)
@@ -101,6 +102,7 @@ def test_the_residual_is_that_of_pixels_also_where_the_last_bins_are_larger():
     assert DISCREPANCY in result.outcome.message
 
 
+@pytest.mark.slow
 def test_a_run_stopped_on_a_grid_with_bins_resumes_there(flame):
     method = Tikhonov(voxels=24, device="cpu", iterations=12)
     first = method(flame, on_step=lambda step: step.step == 3)
@@ -109,6 +111,7 @@ def test_a_run_stopped_on_a_grid_with_bins_resumes_there(flame):
     assert difference(method(flame, resume=first.state), method(flame), 24) < 1e-2
 
 
+@pytest.mark.slow
 def test_a_search_for_the_weight_is_the_same_after_a_pause(flame):
     """Also if the run began from a field, which the resumed run does not have."""
     method = Tikhonov(voxels=24, device="cpu", iterations=3)

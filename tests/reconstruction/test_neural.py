@@ -162,6 +162,7 @@ def test_a_collapsed_field_is_rolled_back(measurement, monkeypatch):
     assert result.outcome.reason == "steps"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("octaves", "width", "depth"),
     [

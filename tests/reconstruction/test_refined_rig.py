@@ -79,6 +79,7 @@ def posterior(measurement: Measurement, field: Field, **settings) -> list[dict]:
     return with_posterior(table, measurement, field, settings)
 
 
+@pytest.mark.slow
 def test_posterior_deviations_are_smaller_than_the_prior_and_grow_with_the_noise(measured):
     rows = posterior(measured, BALLS)
     for row in rows:
@@ -124,6 +125,7 @@ def test_a_withheld_view_is_refined_against_the_field(measured):
     assert error_px(with_corrections(view, [row]), measured, 0) < 0.2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", [Tikhonov, pytest.param(TotalVariation, marks=pytest.mark.slow)])
 def test_voxels_refine_a_rig(measured, method):
     wrong = knocked(measured)
@@ -133,6 +135,7 @@ def test_voxels_refine_a_rig(measured, method):
     assert error_px(with_corrections(wrong, rows), measured) < 0.6 * error_px(wrong, measured)
 
 
+@pytest.mark.slow
 def test_a_view_without_displacements_has_no_posterior(measured):
     """As after a refinement with images."""
     rig = Refinement.for_measurement(measured, SETTINGS["refine"], 0.4, 0.02, 0.05)

@@ -206,6 +206,7 @@ def test_a_part_of_some_views_has_their_rays(measured):
     assert torch.equal(rays.view, alone.rays.view)
 
 
+@pytest.mark.slow
 def test_a_resumed_run_equals_a_complete_one(wrong):
     settings = NeRIF(max_steps=8, points_per_batch=1024, refine=("cameras", "shift"), pose_sigma_mm=0.5, device="cpu")
     whole = settings(wrong)

@@ -100,6 +100,7 @@ def test_emission_from_one_view():
     assert error(MLEM(symmetry="axis", voxels=32)(measured), box, Light()) < 0.08
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shift", [(1.0, -0.7, 0.0), pytest.param((-1.5, 0.4, 2.0), marks=pytest.mark.slow)])
 def test_one_view_determines_the_axis_in_the_image_plane_only(jet, shift):
     symmetry = Symmetry.about("axis", shift, (0.03, -0.02, 1.0), 0.1)
@@ -144,6 +145,7 @@ class Bent(Field):
         return value, -2 / 50 * value[..., None] * off
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", [Tikhonov(voxels=20), pytest.param(NeRIF(max_steps=100), marks=pytest.mark.slow)])
 def test_harmonics_reduce_the_error_of_a_flow_off_the_axis(method):
     box = Box.cube(50.0)

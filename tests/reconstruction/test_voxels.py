@@ -246,6 +246,7 @@ def test_invalid_data(fixed, measurement, monkeypatch):
 # -- memory and devices --------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("upper", "step"), [(None, None), (0.0, None), (None, 0.1)])
 def test_memory_is_not_underestimated(measurement, monkeypatch, upper, step):
     """Arrays of the size of the grid that exist at once, counted by torch and NumPy, fit in the estimate."""

@@ -37,6 +37,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> VolumeSequence:
     return sequence
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "style"), [("m.mp4", "isosurface"), ("m.gif", "slices")])
 def test_a_movie_shows_every_frame_and_they_differ(store, tmp_path, capsys, name, style):
     out = tmp_path / name

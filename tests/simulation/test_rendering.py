@@ -96,6 +96,7 @@ def test_movement_between_pixel_centres_is_that_of_rays_bent_one_by_one(camera, 
     assert float((each - between).std()) < 0.02 * float((between - reference).std())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("projection", sorted(PROJECTIONS))
 def test_a_lens_is_sharp_in_focus_and_blurs_by_its_circle_of_confusion(projection):
     flat = Ring(views=1, arc=(0.0, 0.0), image_size=(3, 60), pixel_pitch=0.04, projection=projection).cameras()[0]

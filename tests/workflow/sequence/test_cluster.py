@@ -268,6 +268,7 @@ def test_a_frame_whose_worker_dies_three_times_is_recorded(film, tmp_path, monke
     assert (progress.done, progress.failed) == (23, 1)
 
 
+@pytest.mark.slow
 def test_a_chunk_whose_work_raises_fails_with_the_reason_and_the_rest_goes_on(five, tmp_path, monkeypatch):
     from distributed import Client
 
@@ -398,6 +399,7 @@ def test_a_file_that_is_no_slurm_is_refused(text, words, tmp_path):
         pass
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
