@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 from torch import Tensor
 
@@ -25,6 +25,7 @@ class Tikhonov(WeightedVoxelReconstructor):
     Source: Tikhonov & Arsenin (1977); for BOST: Nicolas et al., Exp. Fluids 57:13 (2016).
     """
 
+    title: ClassVar[str] = "Tikhonov"
     penalty: Literal["identity", "gradient", "laplacian"] = "gradient"
     """Quantity that is penalised: the field, its gradient, or its Laplacian."""
 
