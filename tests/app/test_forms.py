@@ -11,6 +11,7 @@ from nerif.app.form_view import _control_value, _record_value
 from nerif.app.forms import Form
 from nerif.app.pages.reconstruct import form_of
 from nerif.cli.commands.design import Design
+from nerif.cli.commands.export import Export
 from nerif.cli.commands.reconstruct import COMMANDS
 from nerif.cli.commands.settings import help_of, parse
 from nerif.common.conventions import InputError
@@ -23,6 +24,8 @@ def test_fields_are_those_of_the_record():
     focal = FORM.field("focal_length")
     assert (focal.kind, focal.unit, focal.default, focal.help) == ("number", "mm", 50.0, "Focal length, mm.")
     assert FORM.field("projection").choices == ("perspective", "telecentric")
+    pressure = Form(Export(tyro.MISSING, tyro.MISSING)).field("gas.uniform_pressure")
+    assert (pressure.choices, pressure.optional) == (("auto", "yes", "no"), True)
     assert FORM.field("extra_angles").kind == "words"
     assert FORM.field("views").kind == "integer"
     assert FORM.field("temperature").optional

@@ -1,7 +1,10 @@
 """Choices and limits of settings: stated in the annotations of a dataclass, checked here.
 
 norm: Literal["l2", "squared"] = "squared"
+method: Literal[*METHODS] = "nerif"
 voxels: Annotated[int, Ge(1)] = 64
+
+Choices that are the keys of a registry are read from it whenever they are needed, since annotations are texts.
 """
 
 from __future__ import annotations

@@ -24,7 +24,6 @@ from nerif.common.conventions import InputError
 from nerif.data.measurement_sequence import MeasurementSequence
 from nerif.reconstruction.methods import METHODS
 from nerif.reconstruction.neural.presets import PRESETS, preset
-from nerif.reconstruction.uncertainty.bootstrap import KINDS
 
 __all__ = ["PAGE"]
 
@@ -41,12 +40,12 @@ def form_of(method: str, preset_name: str) -> Form[Reconstruct]:
     record = COMMANDS[method](measurement=tyro.MISSING, out=tyro.MISSING, method=method)  # type: ignore[arg-type]
     if method == "nerif":
         record = replace(record, reconstructor=preset(preset_name), preset=preset_name)  # type: ignore[call-arg]
-    return Form(record, without=WITHOUT, choices={"uncertainty": tuple(KINDS)})
+    return Form(record, without=WITHOUT)
 
 
 def form_of_film(preset_name: str) -> Form[Sequence]:
     """Return the form of a film: where its frames are reconstructed, and how."""
-    record = Sequence(tyro.MISSING, tyro.MISSING, preset=preset_name, reconstructor=preset(preset_name))  # type: ignore[arg-type]
+    record = Sequence(tyro.MISSING, tyro.MISSING, preset=preset_name, reconstructor=preset(preset_name))
     return Form(record, without=FILM_WITHOUT)
 
 

@@ -19,7 +19,7 @@ from nerif.common.installation import install
 from nerif.reconstruction.base import OnStep, Reconstruction, Reconstructor, Step
 from nerif.reconstruction.methods import METHODS
 from nerif.reconstruction.neural.neural import NeRIF
-from nerif.reconstruction.neural.presets import preset
+from nerif.reconstruction.neural.presets import PRESETS, preset
 from nerif.results.directory import RUN
 from nerif.workflow.job import Run
 from nerif.workflow.pipeline import reconstruct_into
@@ -55,7 +55,7 @@ class Reconstruct(Settings):
 class ReconstructNeRIF(Reconstruct):
     """Reconstruct the field of a measurement by a neural field and write a result directory."""
 
-    preset: Literal["auto", "fast", "best", "paper"] = "auto"
+    preset: Literal["auto", *PRESETS] = "auto"  # type: ignore[valid-type]
     """Default settings: fast (CPU), best (GPU), paper, or auto (best with a GPU, else fast)."""
     voxels: int = 100
     """Voxels of the written volume along the longest edge of the box."""

@@ -11,7 +11,6 @@ from typing import ClassVar, Literal
 
 from torch import Tensor
 
-from nerif.common.conventions import InputError
 from nerif.reconstruction.voxels.problem import Iterate, Penalty, Problem, minimise
 from nerif.reconstruction.voxels.settings import WeightedVoxelReconstructor
 
@@ -26,13 +25,8 @@ class Tikhonov(WeightedVoxelReconstructor):
     """
 
     title: ClassVar[str] = "Tikhonov"
-    penalty: Literal["identity", "gradient", "laplacian"] = "gradient"
+    penalty: Literal[*Penalty.KINDS] = "gradient"  # type: ignore[valid-type]
     """Quantity that is penalised: the field, its gradient, or its Laplacian."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.penalty not in Penalty.KINDS:
-            raise InputError(f"expected one of {', '.join(Penalty.KINDS)}, got '{self.penalty}'", field="penalty")
 
     def iterate(self, problem: Problem, x: Tensor, weight: float) -> Iterator[Iterate]:
         yield from minimise(problem, Penalty(problem, self.penalty), weight, x)
