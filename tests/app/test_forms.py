@@ -12,10 +12,11 @@ from nerif.app.forms import Form
 from nerif.app.pages.reconstruct import form_of
 from nerif.cli.commands.design import Design
 from nerif.cli.commands.export import Export
-from nerif.cli.commands.reconstruct import COMMANDS
+from nerif.cli.commands.reconstruct import command_of
 from nerif.cli.commands.settings import help_of, parse
 from nerif.common.conventions import InputError
 from nerif.geometry import Ring
+from nerif.reconstruction.methods import METHODS
 
 FORM = Form(Design(), ("design",))
 
@@ -34,7 +35,7 @@ def test_fields_are_those_of_the_record():
     assert all(f.help for f in FORM.fields)
 
 
-@pytest.mark.parametrize("method", list(COMMANDS))
+@pytest.mark.parametrize("method", METHODS)
 def test_every_field_of_every_method_has_its_text(method):
     form = form_of(method, "auto")
     assert [f.name for f in form.fields if not f.help] == []
@@ -42,7 +43,7 @@ def test_every_field_of_every_method_has_its_text(method):
 
 
 def test_help_is_that_of_the_class_that_has_the_field():
-    assert help_of(COMMANDS["tv"], "tensorboard") == "Write TensorBoard scalars to OUT/tensorboard."
+    assert help_of(command_of("tv"), "tensorboard") == "Write TensorBoard scalars to OUT/tensorboard."
     assert help_of(Ring, "nothing") == ""
 
 

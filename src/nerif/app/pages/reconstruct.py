@@ -18,7 +18,7 @@ from nerif.app.live_view import LiveView
 from nerif.app.pages.page import Page
 from nerif.app.pieces import CommandLine, card, refusals, text_html
 from nerif.app.workspace import Workspace
-from nerif.cli.commands.reconstruct import COMMANDS, Reconstruct
+from nerif.cli.commands.reconstruct import Reconstruct, command_of
 from nerif.cli.commands.sequence import Sequence
 from nerif.common.conventions import InputError
 from nerif.data.measurement_sequence import MeasurementSequence
@@ -37,7 +37,7 @@ FILM_MAIN = ("cluster", "workers", "chunk", "withhold", "voxels")
 
 def form_of(method: str, preset_name: str) -> Form[Reconstruct]:
     """Return the form of a method; the defaults of NeRIF are those of its preset."""
-    record = COMMANDS[method](measurement=tyro.MISSING, out=tyro.MISSING, method=method)  # type: ignore[arg-type]
+    record = command_of(method)(measurement=tyro.MISSING, out=tyro.MISSING, method=method)
     if method == "nerif":
         record = replace(record, reconstructor=preset(preset_name), preset=preset_name)  # type: ignore[call-arg]
     return Form(record, without=WITHOUT)
