@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from commands import metrics_of, run
-from nerif.app.pages.reconstruct import form_of
+from nerif.app.pages.reconstruct import form_of, titles
 from nerif.data.measurement import Measurement
 from nerif.fields.base import Field
 from nerif.reconstruction.base import OnStep, Reconstruction, State
@@ -99,6 +99,7 @@ def test_a_run_its_report_and_its_repetition(toy, measurement, tmp_path):
 
 
 def test_the_app_offers_it(toy):
+    assert titles()["toy"].lower() == toy.title
     form = form_of("toy", "auto")
     assert form.field("gait").choices == ("slow", "brisk")
     assert form.arguments({"gait": "brisk"}) == ["--gait", "brisk"]

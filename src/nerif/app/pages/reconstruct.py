@@ -35,6 +35,11 @@ FILM_WITHOUT = ("config", "measurement", "out", "preset", "force", "time_limit",
 FILM_MAIN = ("cluster", "workers", "chunk", "withhold", "voxels")
 
 
+def titles() -> dict[str, str]:
+    """Return the titles of the methods by name."""
+    return {name: kind.title[:1].upper() + kind.title[1:] for name, kind in METHODS.items()}
+
+
 def form_of(method: str, preset_name: str) -> Form[Reconstruct]:
     """Return the form of a method; the defaults of NeRIF are those of its preset."""
     record = command_of(method)(measurement=tyro.MISSING, out=tyro.MISSING, method=method)
@@ -64,8 +69,7 @@ class ReconstructPage:
                 note = text_html(text, classes="note")
                 self.measurement = FileChoice("Measurement", self.measurements, available, self._there, self._chosen)
                 note.bind_visibility_from(self.measurement.select, "options", lambda names: not names)
-                titles = {name: kind.title[:1].upper() + kind.title[1:] for name, kind in METHODS.items()}
-                self.method = self._select("Method", titles, memory.get("method", "nerif"))
+                self.method = self._select("Method", titles(), memory.get("method", "nerif"))
                 self.about = ui.html("", sanitize=False).classes("help")
                 self.preset = self._select("Preset", ["auto", *PRESETS], memory.get("preset", "auto"))
                 self.out = ui.input("Result directory", value=self._free()).props("outlined dense debounce=250")
