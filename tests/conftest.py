@@ -28,7 +28,9 @@ UNCHECKED = ("kernels_numba", "kernels_symmetric", "fused", "schedule")
 SOURCE = Path(__file__).parents[1] / "src" / "nerif"
 SOLVERS = [p for p in (SOURCE / "reconstruction").rglob("[!_]*.py") if p.stem not in UNCHECKED]
 CHECKED += tuple(".".join(p.relative_to(SOURCE).with_suffix("").parts) for p in SOLVERS)
-if os.environ.get("NERIF_CHECK_SHAPES"):  # make test-all: shapes in annotations, on every call; before nerif is imported
+if os.environ.get(
+    "NERIF_CHECK_SHAPES"
+):  # make test-all: shapes in annotations, on every call; before nerif is imported
     install_import_hook([f"nerif.{part}" for part in CHECKED], "typecheck.check")
 
 from nerif.data.measurement import Measurement

@@ -28,8 +28,13 @@ INTERNAL = {"nerif.cli.cli", "nerif.reconstruction.voxels.kernels_numba", "nerif
 def api_pages(docs: Path) -> dict[str, str]:
     """The pages of the API reference by name.
 
-    A line `% modules nerif.imaging` stands for the modules of the package that no page names.
+    A line `% modules nerif.imaging` stands for the modules of the package that no page names, `% methods` for the table
+    of the reconstruction methods.
     """
+    from nerif.reconstruction.methods import METHODS
+
+    rows = [f"| `{name}` | {kind.title} | {kind.about()} |" for name, kind in METHODS.items()]
+    methods = "\n".join(["| `--method` | name | description |", "|---|---|---|", *rows])
     pages = {path.stem: path.read_text() for path in sorted((docs / "api").glob("*.md"))}
     named = {m for text in pages.values() for m in re.findall(r"automodule:: (\S+)", text)} | INTERNAL
 
@@ -39,6 +44,7 @@ def api_pages(docs: Path) -> dict[str, str]:
         modules = [".".join([match[1], *path.relative_to(folder).with_suffix("").parts]) for path in paths]
         return "\n".join(MODULE.format(m) for m in modules if m not in named)
 
+    pages = {name: text.replace("% methods", methods) for name, text in pages.items()}
     return {name: re.sub(r"^% modules (\S+)\n", rest, text, flags=re.MULTILINE) for name, text in pages.items()}
 
 

@@ -11,10 +11,12 @@ from nerif.app.form_view import _control_value, _record_value
 from nerif.app.forms import Form
 from nerif.app.pages.reconstruct import form_of
 from nerif.cli.commands.design import Design
-from nerif.cli.commands.reconstruct import COMMANDS
+from nerif.cli.commands.export import Export
+from nerif.cli.commands.reconstruct import command_of
 from nerif.cli.commands.settings import help_of, parse
 from nerif.common.conventions import InputError
 from nerif.geometry import Ring
+from nerif.reconstruction.methods import METHODS
 
 FORM = Form(Design(), ("design",))
 
@@ -23,6 +25,8 @@ def test_fields_are_those_of_the_record():
     focal = FORM.field("focal_length")
     assert (focal.kind, focal.unit, focal.default, focal.help) == ("number", "mm", 50.0, "Focal length, mm.")
     assert FORM.field("projection").choices == ("perspective", "telecentric")
+    pressure = Form(Export(tyro.MISSING, tyro.MISSING)).field("gas.uniform_pressure")
+    assert (pressure.choices, pressure.optional) == (("auto", "yes", "no"), True)
     assert FORM.field("extra_angles").kind == "words"
     assert FORM.field("views").kind == "integer"
     assert FORM.field("temperature").optional
@@ -31,7 +35,7 @@ def test_fields_are_those_of_the_record():
     assert all(f.help for f in FORM.fields)
 
 
-@pytest.mark.parametrize("method", list(COMMANDS))
+@pytest.mark.parametrize("method", METHODS)
 def test_every_field_of_every_method_has_its_text(method):
     form = form_of(method, "auto")
     assert [f.name for f in form.fields if not f.help] == []
@@ -39,7 +43,7 @@ def test_every_field_of_every_method_has_its_text(method):
 
 
 def test_help_is_that_of_the_class_that_has_the_field():
-    assert help_of(COMMANDS["tv"], "tensorboard") == "Write TensorBoard scalars to OUT/tensorboard."
+    assert help_of(command_of("tv"), "tensorboard") == "Write TensorBoard scalars to OUT/tensorboard."
     assert help_of(Ring, "nothing") == ""
 
 

@@ -12,6 +12,8 @@ from annotated_types import Ge, Le, Lt
 from nerif.common.settings import Count, NonNegative, Positive, check_settings
 from refusals import refused
 
+SHAPES = {"round": 1}
+
 
 @dataclass(frozen=True)
 class Example:
@@ -23,6 +25,7 @@ class Example:
     shape: tuple[Count, Count] = (1, 2)
     names: tuple[str, ...] = ()
     note: str = ""
+    outline: Literal[*SHAPES] = "round"  # type: ignore[valid-type]
 
     def __post_init__(self) -> None:
         check_settings(self)
@@ -51,3 +54,10 @@ def test_invalid_values(field, value, words):
     with refused(field) as error:
         replace(Example(), **{field: value})
     assert words in str(error.value)
+
+
+def test_choices_of_a_registry_are_those_of_now(monkeypatch):
+    with refused("outline"):
+        Example(outline="square")
+    monkeypatch.setitem(SHAPES, "square", 4)
+    assert Example(outline="square").outline == "square"

@@ -129,7 +129,7 @@ def test_units_of_the_field():
 @pytest.mark.parametrize(
     "change", [{"activation": "step"}, {"depth": 0}, {"width": 0}, {"octaves": -1}, {"skip": -1}, {"directions": 5}]
 )
-def test_invalid_shapes_are_refused(change):
+def test_invalid_shapes_are_refused(change, unchecked):
     with refused(next(iter(change))):
         replace(BASE, **change)
 

@@ -260,7 +260,7 @@ def test_a_wrong_number_of_squares_and_a_large_error_are_refused():
         ({"projection": "telecentric", "side": (NAMES[0], "left")}, "side"),
     ],
 )
-def test_invalid_settings(change, field):
+def test_invalid_settings(change, field, unchecked):
     with refused(field):
         CalibrationSettings(**change)
 

@@ -157,7 +157,7 @@ def test_shake_ignores_outliers_and_leaves_a_still_image_unchanged():
         ("min_correlation", 1.5),
     ],
 )
-def test_invalid_settings(field, value):
+def test_invalid_settings(field, value, unchecked):
     with refused(field):
         DisplacementSettings(**{field: value})
 

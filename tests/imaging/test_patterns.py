@@ -51,7 +51,7 @@ def test_wavelet_noise_has_one_band_and_multiscale_noise_many():
 
 
 @pytest.mark.parametrize(("field", "value"), [("kind", "stripes"), ("width", 0.0), ("fill", 0.9), ("dot", 30.0)])
-def test_invalid_patterns(field, value):
+def test_invalid_patterns(field, value, unchecked):
     with refused(field):
         Background(**{"width": 60.0, "height": 40.0, "dot": 1.0, field: value})
     with refused("pixel"):

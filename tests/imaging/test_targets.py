@@ -96,7 +96,7 @@ def test_points_are_centred_and_a_pitch_apart(kind):
 @pytest.mark.parametrize(
     ("values", "field"),
     [
-        (("checker", 9, 7), "target kind"),
+        (("checker", 9, 7), "kind"),
         (("chessboard", 9, 7), "target"),
         (("chessboard", 3, 2), "target"),
         (("charuco", 9, 7, 0.0), "target"),
@@ -105,6 +105,6 @@ def test_points_are_centred_and_a_pitch_apart(kind):
         (("charuco", 12, 10, 5.0, 0.0, "DICT_4X4_50"), "dictionary"),
     ],
 )
-def test_targets_that_cannot_be(values, field):
+def test_targets_that_cannot_be(values, field, unchecked):
     with refused(field):
         CalibrationTarget(*values).raster(0.5)

@@ -110,7 +110,7 @@ def test_functions_return_the_axes_they_draw_into(volume, whole):
     for draw, *data in (
         (drawing.draw_slice, volume, "y"),
         (drawing.draw_map, np.zeros((3, 4)), (-1.0, 1.0)),
-        (figures.draw_history, result.history, "nerif"),
+        (figures.draw_history, result.history),
         (figures.draw_slice_scores, result.metrics.slices),
         (figures.draw_view_scores, result.metrics.views),
         (figures.draw_residuals, residuals_over_sigma(result.reprojection)["displacement"]),
@@ -122,7 +122,7 @@ def test_functions_return_the_axes_they_draw_into(volume, whole):
 def test_the_curves_of_a_run_on_voxels_are_residual_penalty_and_objective():
     record = {"step": 1.0, "seconds": 1.0, "voxels": 24.0, "bin_edge": 4.0, "weight": 1e-3, "residual": 0.5}
     record |= {"penalty": 0.2, "objective": 0.7, "residual_over_sigma": 1.5}
-    axes = figures.draw_history(Figure().subplots(), [record, {**record, "seconds": 2.0, "bin_edge": 1.0}], "tikhonov")
+    axes = figures.draw_history(Figure().subplots(), [record, {**record, "seconds": 2.0, "bin_edge": 1.0}])
     labels = {str(line.get_label()) for line in axes.lines}
     assert labels >= {"residual", "penalty", "objective"}
     assert not labels & {"bin edge", "voxels", "weight"}

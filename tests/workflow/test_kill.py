@@ -24,7 +24,7 @@ from nerif.workflow.pipeline import reconstruct_into
 from nerif.workflow.steps import CLOSING, STEPS
 
 CONTEXT = multiprocessing.get_context("forkserver")
-PRELOADED = ["pytest", "xarray", "h5netcdf", "scipy.ndimage", "matplotlib.figure", "skimage.metrics", "nerif.workflow.steps"]
+PRELOADED = ["pytest", "xarray", "h5netcdf", "scipy.ndimage", "matplotlib.figure", "nerif.workflow.steps"]
 RUN = Run(uncertainty="fast", checkpoint_every=0.0)
 NETWORK = NetworkShape(depth=2, width=32, octaves=3)
 METHODS: dict[str, Reconstructor] = {

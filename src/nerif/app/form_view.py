@@ -139,7 +139,8 @@ class FormView(Generic[T]):
         if field.kind == "switch":
             return ui.switch(label, value=bool(value))
         if field.kind == "choice":
-            return ui.select(list(field.choices), label=label, value=value).props("outlined dense options-dense")
+            choice = ui.select(list(field.choices), label=label, value=value, clearable=field.optional)
+            return choice.props("outlined dense options-dense")
         if field.kind in ("number", "integer"):
             control = ui.number(label, value=value, suffix=field.unit or None)
             return control.props('outlined dense debounce=150 step="any"')

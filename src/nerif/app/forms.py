@@ -11,9 +11,8 @@ import types
 import typing
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, Literal, TypeVar
 
 import tyro
 
@@ -80,7 +79,6 @@ class Form(Generic[T]):
     verb : first arguments of the command line
     only : names of the fields to show; empty: all
     without : names of the fields to hide
-    choices : valid words of fields that the record does not limit
     """
 
     def __init__(
@@ -89,10 +87,9 @@ class Form(Generic[T]):
         verb: Sequence[str] = (),
         only: Sequence[str] = (),
         without: Collection[str] = HIDDEN,
-        choices: Mapping[str, Sequence[str]] | None = None,
     ) -> None:
         self.record, self.verb = record, tuple(verb)
-        fields = {f.name: f for f in _fields(record, choices or {})}
+        fields = {f.name: f for f in _fields(record)}
         if others := [name for name in only if name not in fields]:
             raise InputError(f"expected some of {', '.join(fields)}, got {', '.join(others)}", field="only")
         self.fields = tuple(fields[name] for name in only or fields if name not in without)
@@ -144,7 +141,7 @@ class Form(Generic[T]):
         return [*self.verb, *words]
 
 
-def _fields(record: Any, choices: Mapping[str, Sequence[str]], prefix: str = "") -> list[FormField]:
+def _fields(record: Any, prefix: str = "") -> list[FormField]:
     """Return the fields of a record; those of nested records are in the place of the record."""
     cls, fields = type(record), []
     for name, where in flat_names(cls).items():
@@ -156,56 +153,29 @@ def _fields(record: Any, choices: Mapping[str, Sequence[str]], prefix: str = "")
             hint = hint.__origin__
         value = getattr(holder, name)
         if dataclasses.is_dataclass(value):
-            fields += _fields(value, choices, f"{prefix}{name}.")
+            fields += _fields(value, f"{prefix}{name}.")
             continue
         default = None if value in MISSING else value
         text = help_of(type(holder), name)
-        kind, optional = _kind(hint)
-        words = tuple(choices.get(prefix + name, ())) or (choices_of(holder, name) if kind == "text" else ())
-        kind = "choice" if words else kind
+        kind, words, optional = _kind(hint)
         numbers = kind in ("integer", "number") or (kind == "words" and "str" not in str(hint))
         unit = _unit(text) if numbers else ""
         fields.append(FormField(prefix + name, kind, text, unit, default, words, optional))
     return fields
 
 
-def _kind(hint: Any) -> tuple[str, bool]:
-    """Return the kind of control for a type, and whether None is valid."""
+def _kind(hint: Any) -> tuple[str, tuple[str, ...], bool]:
+    """Return the kind of control for a type, its choices, and whether None is valid."""
     options = typing.get_args(hint) if typing.get_origin(hint) in (types.UnionType, typing.Union) else (hint,)
     optional = type(None) in options
-    hint = next(o for o in options if o is not type(None))
-    hint = hint.__origin__ if typing.get_origin(hint) is typing.Annotated else hint
+    others = [o for o in options if o is not type(None)]
+    hint = others[0].__origin__ if typing.get_origin(others[0]) is typing.Annotated else others[0]
+    if typing.get_origin(hint) is Literal and len(others) == 1:
+        return "choice", typing.get_args(hint), optional
     if typing.get_origin(hint) is tuple:
-        return "words", optional
+        return "words", (), optional
     kinds = {bool: "switch", int: "integer", float: "number", str: "text", Path: "text"}
-    return kinds.get(hint, "text"), optional
-
-
-def choices_of(record: Any, name: str) -> tuple[str, ...]:
-    """Return the valid words of a field, from the error message of the record; empty for free text."""
-    try:
-        return _choices(record, name)
-    except TypeError:  # the record has no hash
-        return ()
-
-
-@cache
-def _choices(record: Any, name: str) -> tuple[str, ...]:
-    try:
-        dataclasses.replace(record, **{name: "?"})
-    except InputError as error:
-        listed = re.search(r"expected (?:one of )?([\w+., -]+?)(?:,? got| \(|;|$)", str(error))
-        words = re.split(r",? or |, ", listed[1]) if listed else []
-        return tuple(dict.fromkeys(words)) if all(_accepts(record, name, w) for w in words) else ()
-    return ()
-
-
-def _accepts(record: Any, name: str, word: str) -> bool:
-    try:
-        dataclasses.replace(record, **{name: word})
-    except InputError:
-        return False
-    return True
+    return kinds.get(hint, "text"), (), optional
 
 
 def _unit(text: str) -> str:

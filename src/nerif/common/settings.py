@@ -1,13 +1,15 @@
 """Choices and limits of settings: stated in the annotations of a dataclass, checked here.
 
 norm: Literal["l2", "squared"] = "squared"
+method: Literal[*METHODS] = "nerif"
 voxels: Annotated[int, Ge(1)] = 64
+
+Choices that are the keys of a registry are read from it whenever they are needed, since annotations are texts.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import functools
 import math
 import operator
 import types
@@ -40,17 +42,11 @@ def check_settings(settings: Any) -> None:
 
     Types are not checked: the command line, settings files and the type checker do that.
     """
-    cls: Any = type(settings)
-    for name, hint in _hints(cls).items():
-        value = getattr(settings, name)
-        if expected := _violated(value, hint):
-            raise InputError(f"expected {expected}, got {value!r}", field=name)
-
-
-@functools.cache
-def _hints(cls: Any) -> dict[str, Any]:
-    hints = typing.get_type_hints(cls, include_extras=True)
-    return {field.name: hints[field.name] for field in dataclasses.fields(cls)}
+    hints = typing.get_type_hints(type(settings), include_extras=True)
+    for field in dataclasses.fields(settings):
+        value = getattr(settings, field.name)
+        if expected := _violated(value, hints[field.name]):
+            raise InputError(f"expected {expected}, got {value!r}", field=field.name)
 
 
 def _violated(value: Any, hint: Any) -> str:

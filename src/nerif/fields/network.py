@@ -12,13 +12,14 @@ import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from nerif.common.conventions import InputError, Points, Values, Vectors
+from nerif.common.settings import check_settings
 from nerif.common.transfer import constant
 from nerif.fields.base import Field
 from nerif.geometry import Box
@@ -131,14 +132,13 @@ class NetworkShape:
     """Neurons of each head (paper: 64); 0 for one linear output."""
     gradient_head: bool = False
     """Whether the three heads for grad(n) exist."""
-    activation: str = "silu"
+    activation: Literal[*ACTIVATIONS] = "silu"  # type: ignore[valid-type]
     """Silu, softplus, tanh, relu or sine."""
     octave_decay: float = 0.0
     """Weight 2^(-k octave_decay) of octave k of the encoding (paper: 0)."""
 
     def __post_init__(self) -> None:
-        if self.activation not in ACTIVATIONS:
-            raise InputError(f"expected one of {', '.join(ACTIVATIONS)}, got '{self.activation}'", field="activation")
+        check_settings(self)
         if self.directions not in DIRECTIONS:
             raise InputError(
                 f"expected one of {', '.join(map(str, DIRECTIONS))}, got {self.directions}", field="directions"

@@ -14,8 +14,8 @@ from nerif.forward.images import Images
 from nerif.forward.interferometry import Interferometry
 
 __all__ = [
-    "AUTO", "MODELS", "TECHNIQUES", "check_model", "check_simulated", "forward_model", "forward_models", "model_of",
-    "technique", "technique_of",
+    "AUTO", "MODELS", "MODEL_NAMES", "TECHNIQUES", "check_model", "check_simulated", "forward_model", "forward_models",
+    "model_of", "technique", "technique_of",
 ]  # fmt: skip
 
 # by their names in files; a technique of your own is one more entry
@@ -28,6 +28,7 @@ AUTO = "auto"
 MODELS: dict[str, tuple[str, ...]] = {
     Deflection.name: tuple(deflection.MODELS), Images.name: ("lever_arm",), Absorption.name: tuple(absorption.MODELS)
 }  # fmt: skip
+MODEL_NAMES = (AUTO, *(name for names in MODELS.values() for name in names))
 
 
 def technique(name: str) -> type[ForwardModel]:
@@ -51,9 +52,8 @@ def technique_of(quantity: str) -> type[ForwardModel]:
 
 def check_model(model: str) -> None:
     """Raise InputError for a name that is no model of any technique."""
-    names = (AUTO, *(name for names in MODELS.values() for name in names))
-    if model not in names:
-        raise InputError(f"expected one of {', '.join(names)}, got '{model}'", field="model")
+    if model not in MODEL_NAMES:
+        raise InputError(f"expected one of {', '.join(MODEL_NAMES)}, got '{model}'", field="model")
 
 
 def model_of(kind: type[ForwardModel], name: str) -> str:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import torch
 
 from nerif.common.conventions import InputError
 from nerif.common.settings import Count, Length, check_settings
-from nerif.geometry.camera import Camera, Plane, Projection, projection_named
+from nerif.geometry.camera import PROJECTIONS, Camera, Plane, Projection, projection_named
 from nerif.geometry.grid import Box
 
 __all__ = ["Ring", "paper_rig"]
@@ -28,7 +29,7 @@ class Ring:
     """Azimuths of further cameras, such as withheld ones, degrees."""
     elevation: float = 0.0
     """Elevation of the optical axes above the horizontal, degrees."""
-    projection: str = "perspective"
+    projection: Literal[*PROJECTIONS] = "perspective"  # type: ignore[valid-type]
     """Projection: perspective, or telecentric (parallel rays)."""
     focal_length: Length = 50.0
     """Focal length, mm."""
@@ -48,7 +49,6 @@ class Ring:
         for name in ("arc", "extra_angles", "elevation"):
             if not math.isfinite(math.fsum(np.atleast_1d(getattr(self, name)))):
                 raise InputError(f"expected degrees, got {getattr(self, name)}", field=name)
-        _ = self.kind  # validates its name
         if self.magnification is not None and self.kind.shows_depth:
             raise InputError(f"expected projection = telecentric, got {self.projection}", field="magnification")
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 from annotated_types import Gt, Le, Lt
@@ -36,7 +36,7 @@ class Background:
     scales: Atcheson et al., Exp. Fluids 46 (2009) 467.
     """
 
-    kind: str = "dots"
+    kind: Literal[*KINDS] = "dots"  # type: ignore[valid-type]
     """dots (random, hardly overlapping), wavelet (band-limited noise) or multiscale (noise on all scales)."""
     width: Length = 200.0
     """Width of the pattern, mm."""
@@ -50,8 +50,6 @@ class Background:
     """Of the pattern; different for each camera."""
 
     def __post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise InputError(f"expected one of {', '.join(KINDS)}, got '{self.kind}'", field="kind")
         check_settings(self)
         if 4 * self.dot > (edge := min(self.width, self.height)):
             raise InputError(f"expected a quarter of the pattern ({edge:g} mm) or less, got {self.dot}", field="dot")

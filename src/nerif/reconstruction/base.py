@@ -6,10 +6,11 @@ A Reconstructor is an immutable record of settings; called with a Measurement it
 from __future__ import annotations
 
 import dataclasses
+import inspect
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 from torch import Tensor
 
@@ -157,8 +158,14 @@ class Reconstructor(ABC):
     Invalid settings raise InputError when the record is made.
     """
 
+    title: ClassVar[str]  # as printed
     aperture: str  # whether pixels have an aperture (aperture.py)
     source: str  # images, displacements or both (sources.py)
+
+    @classmethod
+    def about(cls) -> str:
+        """Return the first line of the description of the method."""
+        return (inspect.getdoc(cls) or cls.title).splitlines()[0]
 
     @abstractmethod
     def __call__(

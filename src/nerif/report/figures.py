@@ -41,7 +41,7 @@ BAND_SIGMAS = TAILS["p95"]  # on either side of a band of 90 %
 GRID: dict[str, Any] = {"visible": True, "which": "major", "color": "0.9", "linewidth": 0.6}
 
 
-def draw_history(axes: Axes, history: list[dict[str, float]], method: str) -> Axes:
+def draw_history(axes: Axes, history: list[dict[str, float]]) -> Axes:
     """Draw the convergence: terms of the loss, or residual and penalty, over time; logarithmic."""
     names = dict.fromkeys(name for record in history for name in record)
     across = "seconds" if "seconds" in names else "step"
@@ -59,7 +59,7 @@ def draw_history(axes: Axes, history: list[dict[str, float]], method: str) -> Ax
         )  # fmt: skip
         curves += 1
     axes.set(yscale="log", xlabel="time [s]" if across == "seconds" else "step")
-    axes.set_ylabel("loss [1]" if method == "nerif" else "scaled residual, penalty [1]")
+    axes.set_ylabel("loss [1]" if "loss" in names else "scaled residual, penalty [1]")
     axes.grid(**GRID)
     if curves:
         axes.legend(frameon=False)

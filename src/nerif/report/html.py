@@ -133,7 +133,7 @@ def _curves(result: Result) -> list[tuple[str, str]]:
         curves.append((title, svg(lambda axes: draw(axes, *data))))
 
     if result.history:
-        add("Convergence", figures.draw_history, result.history, str(result.settings.get("method", "nerif")))
+        add("Convergence", figures.draw_history, result.history)
     if result.reprojection is not None:
         several = len(result.reprojection.measurement.observations) > 1
         for name, residuals in residuals_over_sigma(result.reprojection).items():

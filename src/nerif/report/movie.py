@@ -6,21 +6,21 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from nerif.common.conventions import InputError
 from nerif.common.files import atomic
 from nerif.common.installation import install
+from nerif.common.settings import check_settings
 from nerif.data.volume import Volume, field_of
 from nerif.data.volume_sequence import VolumeSequence
 from nerif.plotting.drawing import COLOUR_MAPS, LABELS, SEQUENTIAL, colour_range, plotted_values
 from nerif.report.isosurface import default_level, filled
 
-__all__ = ["STYLES", "Movie", "finished_frames", "ranges_over_time"]
+__all__ = ["Movie", "finished_frames", "ranges_over_time"]
 
-STYLES = ("isosurface", "slices")
 FORMATS = (".mp4", ".gif")
 MASKED, GREY = "masked", "#BEBEBE"
 
@@ -39,7 +39,7 @@ class Movie:
     frames_per_second : of the movie
     """
 
-    style: str = "isosurface"
+    style: Literal["isosurface", "slices"] = "isosurface"
     quantity: str = ""
     level: float | None = None
     size: tuple[int, int] = (960, 720)
@@ -48,8 +48,7 @@ class Movie:
     frames_per_second: float = 20.0
 
     def __post_init__(self) -> None:
-        if self.style not in STYLES:
-            raise InputError(f"expected one of {', '.join(STYLES)}, got '{self.style}'", field="style")
+        check_settings(self)
         if min(self.size) < 16 or any(s % 2 for s in self.size):
             raise InputError(f"expected an even width and height of 16 px or more, got {self.size}", field="size")
         if not self.frames_per_second > 0:

@@ -108,8 +108,7 @@ def figures_of(result: Result, single: float, double: float) -> Iterator[tuple[s
     if metrics.coverage and "reliability" in metrics.coverage:
         yield "reliability", plot(0.9, figures.draw_reliability, metrics.coverage)
     if result.history:
-        method = str(result.settings.get("method", "nerif"))
-        yield "history", plot(0.7, figures.draw_history, result.history, method)
+        yield "history", plot(0.7, figures.draw_history, result.history)
     if metrics.slices:
         yield "slice_scores", plot(0.7, figures.draw_slice_scores, metrics.slices)
 

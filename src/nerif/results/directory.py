@@ -28,6 +28,7 @@ from nerif.geometry.symmetry import Symmetry
 from nerif.reconstruction import files as field_files
 from nerif.reconstruction.base import Reconstruction, State
 from nerif.reconstruction.files import CHECKPOINT, FIELD, read_field, read_quantity, read_state
+from nerif.reconstruction.methods import METHODS
 from nerif.results.metrics import Metrics
 
 __all__ = [
@@ -42,10 +43,6 @@ FILES = (RUN, METRICS, HISTORY, FIELD, CHECKPOINT, VOLUME, VOLUME_VTI, REPROJECT
 
 RUN_HEAD = "# nerif reconstruct --config run.toml -o OTHER repeats this run\n"
 UNREADABLE = (InputError, OSError, ValueError, KeyError, TypeError)
-METHODS = {
-    "nerif": "NeRIF", "tikhonov": "Tikhonov", "landweber": "Landweber", "tv": "total variation", "mlem": "MLEM",
-    "mart": "MART",
-}  # fmt: skip
 
 T = TypeVar("T")
 
@@ -108,7 +105,7 @@ class Result:
     def method(self) -> str:
         """Name of the method, as printed."""
         method = str(self.settings.get("method", "unknown method"))
-        return METHODS.get(method, method)
+        return METHODS[method].title if method in METHODS else method
 
 
 class ResultDirectory:

@@ -28,7 +28,7 @@ from nerif.reconstruction.progress import QUIET, Monitor
 from nerif.reconstruction.shared_settings import SharedSettings
 from nerif.reconstruction.sources import check_source
 from nerif.reconstruction.symmetry import axis_of, with_axis
-from nerif.reconstruction.uncertainty.bootstrap import Trials
+from nerif.reconstruction.uncertainty.bootstrap import KINDS, Trials
 from nerif.reconstruction.voxels.settings import VoxelReconstructor
 from nerif.results.directory import ResultDirectory
 from nerif.results.live import Live
@@ -50,7 +50,7 @@ class Run:
     """Result directory with the initial field: a reconstruction by any method in the same box."""
     fit_gains: bool = False
     """For emission: fit the intensity gain of each camera (not of withheld views)."""
-    uncertainty: Literal["off", "fast", "full"] = "off"
+    uncertainty: Literal[*KINDS] = "off"  # type: ignore[valid-type]
     """Standard deviations of every quantity by bootstrap: off, fast (2 trials) or full (8 trials)."""
     report: bool = True
     """Write report.html at the end."""

@@ -24,7 +24,7 @@ from nerif.common.conventions import InputError
 from nerif.common.files import read_toml
 from nerif.imaging.calibration.result import ImageError
 from nerif.imaging.calibration.simple_rig import SimpleRig
-from nerif.imaging.calibration.targets import KINDS, CalibrationTarget
+from nerif.imaging.calibration.targets import CalibrationTarget
 from nerif.imaging.readers.views import View
 
 __all__ = ["PAGE"]
@@ -46,8 +46,7 @@ def form_of(simple: bool, settings: dict[str, Any] | None = None) -> Form[Calibr
     if simple:
         return Form(record, only=SIMPLE)
     record = merge(record, settings or {}, SETTINGS)
-    choices = {"target.kind": KINDS, "projection": ("perspective", "telecentric")}
-    return Form(record, without=(*BY_PAGE, *RULER), choices=choices)
+    return Form(record, without=(*BY_PAGE, *RULER))
 
 
 class CalibrationPage:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
+from html import escape
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -17,12 +18,12 @@ from nerif.app.live_view import LiveView
 from nerif.app.pages.page import Page
 from nerif.app.pieces import CommandLine, card, refusals, text_html
 from nerif.app.workspace import Workspace
-from nerif.cli.commands.reconstruct import COMMANDS, Reconstruct
+from nerif.cli.commands.reconstruct import Reconstruct, command_of
 from nerif.cli.commands.sequence import Sequence
 from nerif.common.conventions import InputError
 from nerif.data.measurement_sequence import MeasurementSequence
+from nerif.reconstruction.methods import METHODS
 from nerif.reconstruction.neural.presets import PRESETS, preset
-from nerif.reconstruction.uncertainty.bootstrap import KINDS
 
 __all__ = ["PAGE"]
 
@@ -32,23 +33,24 @@ FILM = ".zarr"
 VALUES = {False: "values", True: "film_values"}  # of what is not a film, and of one
 FILM_WITHOUT = ("config", "measurement", "out", "preset", "force", "time_limit", "refine")
 FILM_MAIN = ("cluster", "workers", "chunk", "withhold", "voxels")
-LABELS = {
-    "nerif": "NeRIF: a neural field", "tikhonov": "Tikhonov, on voxels", "landweber": "Landweber, on voxels",
-    "tv": "Total variation, on voxels", "mlem": "MLEM, never negative", "mart": "MART, never negative",
-}  # fmt: skip
+
+
+def titles() -> dict[str, str]:
+    """Return the titles of the methods by name."""
+    return {name: kind.title[:1].upper() + kind.title[1:] for name, kind in METHODS.items()}
 
 
 def form_of(method: str, preset_name: str) -> Form[Reconstruct]:
     """Return the form of a method; the defaults of NeRIF are those of its preset."""
-    record = COMMANDS[method](measurement=tyro.MISSING, out=tyro.MISSING, method=method)  # type: ignore[arg-type]
+    record = command_of(method)(measurement=tyro.MISSING, out=tyro.MISSING, method=method)
     if method == "nerif":
         record = replace(record, reconstructor=preset(preset_name), preset=preset_name)  # type: ignore[call-arg]
-    return Form(record, without=WITHOUT, choices={"uncertainty": tuple(KINDS)})
+    return Form(record, without=WITHOUT)
 
 
 def form_of_film(preset_name: str) -> Form[Sequence]:
     """Return the form of a film: where its frames are reconstructed, and how."""
-    record = Sequence(tyro.MISSING, tyro.MISSING, preset=preset_name, reconstructor=preset(preset_name))  # type: ignore[arg-type]
+    record = Sequence(tyro.MISSING, tyro.MISSING, preset=preset_name, reconstructor=preset(preset_name))
     return Form(record, without=FILM_WITHOUT)
 
 
@@ -67,7 +69,8 @@ class ReconstructPage:
                 note = text_html(text, classes="note")
                 self.measurement = FileChoice("Measurement", self.measurements, available, self._there, self._chosen)
                 note.bind_visibility_from(self.measurement.select, "options", lambda names: not names)
-                self.method = self._select("Method", LABELS, memory.get("method", "nerif"))
+                self.method = self._select("Method", titles(), memory.get("method", "nerif"))
+                self.about = ui.html("", sanitize=False).classes("help")
                 self.preset = self._select("Preset", ["auto", *PRESETS], memory.get("preset", "auto"))
                 self.out = ui.input("Result directory", value=self._free()).props("outlined dense debounce=250")
                 self.out.on_value_change(self._show)
@@ -108,6 +111,8 @@ class ReconstructPage:
         if self.film:
             form = form_of_film(self.preset.value)
         self.method.set_visibility(not self.film)
+        self.about.set_visibility(not self.film)
+        self.about.set_content(f"<p>{escape(METHODS[self.method.value].about())}</p>")
         self.preset.set_visibility(self.film or self.method.value == "nerif")
         self.out.props["label"] = "Result (.zarr)" if self.film else "Result directory"
         self.out.update()

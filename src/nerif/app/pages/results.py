@@ -24,8 +24,6 @@ from nerif.cli.commands.figures import Figures
 from nerif.cli.commands.movie import MovieCommand
 from nerif.common.installation import install
 from nerif.data.exports import FORMATS
-from nerif.report.movie import STYLES
-from nerif.report.pages import JOURNALS
 
 __all__ = ["PAGE"]
 
@@ -182,7 +180,7 @@ class ResultsPage:
 
     def _figures(self) -> None:
         record = Figures(tyro.MISSING)
-        form = Form(record, without=("config", "result", "out"), choices={"journal": tuple(JOURNALS)})
+        form = Form(record, without=("config", "result", "out"))
         with ui.element("div").classes("form"):
             text_html(f"They are written to {self.row.name}/figures.", classes="note")
             JobForm(
@@ -192,7 +190,7 @@ class ResultsPage:
 
     def _movie(self) -> None:
         record = MovieCommand(tyro.MISSING, tyro.MISSING)
-        form = Form(record, without=("config", "result", "out", "force"), choices={"style": STYLES})
+        form = Form(record, without=("config", "result", "out", "force"))
         with ui.element("div").classes("form"):
             _, name = self._named("Format", {".mp4": "H.264 (.mp4)", ".gif": "GIF (.gif)"})
             made = JobForm(

@@ -12,7 +12,7 @@ from annotated_types import Ge, Le
 from nerif.cli.commands.output import counting_bar, say
 from nerif.cli.commands.settings import Settings, command
 from nerif.common.conventions import InputError
-from nerif.report.pages import save_figures
+from nerif.report.pages import JOURNALS, save_figures
 from nerif.results.directory import FIGURES, ResultDirectory
 
 __all__ = ["Figures", "main", "run"]
@@ -26,7 +26,7 @@ class Figures(Settings):
     """Result directory of nerif reconstruct."""
     out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
     """Folder to write (default: RESULT/figures)."""
-    journal: Literal["elsevier", "aip", "aps", "nature", "springer"] = "elsevier"
+    journal: Literal[*JOURNALS] = "elsevier"  # type: ignore[valid-type]
     """Journal whose column widths are used."""
     dpi: Annotated[int, Ge(20), Le(2400)] = 300
     """Resolution of the PNG files in dots per inch."""

@@ -6,6 +6,7 @@ import inspect
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -16,15 +17,17 @@ from nerif.cli.commands.output import MONITOR
 from nerif.cli.commands.settings import Flat, Settings, flag_value, read_settings, setting_of
 from nerif.common.conventions import InputError
 from nerif.common.installation import install
+from nerif.common.settings import Count
 from nerif.reconstruction.base import OnStep, Reconstruction, Reconstructor, Step
 from nerif.reconstruction.methods import METHODS
 from nerif.reconstruction.neural.neural import NeRIF
-from nerif.reconstruction.neural.presets import preset
+from nerif.reconstruction.neural.presets import PRESETS, preset
+from nerif.reconstruction.voxels.settings import VoxelReconstructor
 from nerif.results.directory import RUN
 from nerif.workflow.job import Run
 from nerif.workflow.pipeline import reconstruct_into
 
-__all__ = ["COMMANDS", "Reconstruct", "ReconstructNeRIF", "main", "run"]
+__all__ = ["Reconstruct", "ReconstructNeRIF", "command_of", "main", "run"]
 
 SCALAR_STEPS, SCALAR_SECONDS = 20, 5.0  # between TensorBoard scalars, whichever is shorter
 
@@ -37,7 +40,7 @@ class Reconstruct(Settings):
     """Measurement file (.nc); may be omitted with --resume."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Result directory to write."""
-    method: Literal["nerif", "tikhonov", "landweber", "tv", "mlem", "mart"] = "nerif"
+    method: Literal[*METHODS] = "nerif"  # type: ignore[valid-type]
     """Reconstruction method; --method NAME --help lists its options."""
     force: bool = False
     """Overwrite an existing result directory."""
@@ -52,30 +55,41 @@ class Reconstruct(Settings):
 
 
 @dataclass(frozen=True)
-class ReconstructNeRIF(Reconstruct):
+class ReconstructGridless(Reconstruct):
+    """Settings for methods without voxels of their own."""
+
+    voxels: Count = 100
+    """Voxels of the written volume along the longest edge of the box."""
+
+
+@dataclass(frozen=True)
+class ReconstructNeRIF(ReconstructGridless):
     """Reconstruct the field of a measurement by a neural field and write a result directory."""
 
-    preset: Literal["auto", "fast", "best", "paper"] = "auto"
+    preset: Literal["auto", *PRESETS] = "auto"  # type: ignore[valid-type]
     """Default settings: fast (CPU), best (GPU), paper, or auto (best with a GPU, else fast)."""
-    voxels: int = 100
-    """Voxels of the written volume along the longest edge of the box."""
     reconstructor: Annotated[NeRIF, Flat] = field(default_factory=NeRIF)
 
 
-def _command_of(method: str, kind: type[Reconstructor]) -> type[Reconstruct]:
+def command_of(method: str) -> type[Reconstruct]:
     """Return the settings of the command for a method: the common ones and those of the method."""
+    if method not in METHODS:
+        raise InputError(f"expected one of {', '.join(METHODS)}, got '{method}'", field="method")
+    kind = METHODS[method]
+    return ReconstructNeRIF if kind is NeRIF else _command(method, kind)
+
+
+@cache
+def _command(method: str, kind: type[Reconstructor]) -> type[Reconstruct]:
+    common = Reconstruct if issubclass(kind, VoxelReconstructor) else ReconstructGridless
     namespace = {
         "__module__": __name__,
-        "__doc__": f"{inspect.getdoc(Reconstruct)}\n\n{(inspect.getdoc(kind) or '').splitlines()[0]}",
+        "__doc__": f"{inspect.getdoc(Reconstruct)}\n\n{kind.about()}",
         "__annotations__": {"method": Reconstruct.__annotations__["method"], "reconstructor": Annotated[kind, Flat]},
         "method": method,
         "reconstructor": field(default_factory=kind),
     }
-    return dataclass(frozen=True)(type(f"Reconstruct{kind.__name__}", (Reconstruct,), namespace))
-
-
-COMMANDS = {method: _command_of(method, kind) for method, kind in METHODS.items()} | {"nerif": ReconstructNeRIF}
-"""Settings by method."""
+    return dataclass(frozen=True)(type(f"Reconstruct{kind.__name__}", (common,), namespace))
 
 
 def run(settings: Reconstruct) -> Reconstruction:
@@ -123,8 +137,7 @@ def main(arguments: list[str]) -> None:
         if not file.is_file():
             raise InputError(f"expected an interrupted run to resume, got no {RUN} in it", field=out)
     method = setting_of("method", arguments, "nerif", file)
-    if method not in COMMANDS:
-        raise InputError(f"expected one of {', '.join(COMMANDS)}, got '{method}'", field="method")
+    command = command_of(method)
     defaults: dict[str, Any] = {"measurement": tyro.MISSING, "out": tyro.MISSING, "method": method}
     if method == "nerif":
         name = setting_of("preset", arguments, "auto", file)
@@ -132,8 +145,8 @@ def main(arguments: list[str]) -> None:
     if arguments[-2:] == ["--help", "all"]:
         arguments = arguments[:-1]
     elif {"-h", "--help"} & set(arguments):
-        default = COMMANDS[method](**defaults)
+        default = command(**defaults)
         print(grouped_help(default, "nerif reconstruct", inspect.getdoc(type(default)) or ""), end="")
         return
-    if run(read_settings(COMMANDS[method](**defaults), arguments, "reconstruct", file)).outcome.failed:
+    if run(read_settings(command(**defaults), arguments, "reconstruct", file)).outcome.failed:
         raise SystemExit(1)

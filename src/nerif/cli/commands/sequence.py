@@ -12,7 +12,7 @@ from annotated_types import Ge
 from nerif.cli.commands.output import MONITOR, figures_bar
 from nerif.cli.commands.settings import Flat, Settings, read_settings, setting_of
 from nerif.reconstruction.neural.neural import NeRIF
-from nerif.reconstruction.neural.presets import preset
+from nerif.reconstruction.neural.presets import PRESETS, preset
 from nerif.workflow.sequence.plan import SequenceSettings
 from nerif.workflow.sequence.reconstruct import reconstruct_sequence
 from nerif.workflow.sequence.run import Progress
@@ -45,7 +45,7 @@ class Sequence(Settings):
     """Retry the failed frames of an earlier run."""
     force: bool = False
     """Start again, discarding the content of --out."""
-    preset: Literal["auto", "fast", "best", "paper"] = "auto"
+    preset: Literal["auto", *PRESETS] = "auto"  # type: ignore[valid-type]
     """Default settings: fast (CPU), best (GPU), paper, or auto (best with a GPU, else fast)."""
     frames: Annotated[SequenceSettings, Flat] = field(default_factory=SequenceSettings)
     reconstructor: Annotated[NeRIF, Flat] = field(default_factory=NeRIF)
@@ -74,6 +74,6 @@ def main(arguments: list[str]) -> None:
     """Parse and run."""
     name = setting_of("preset", arguments, "auto")
     reconstructor = preset(name)
-    default = Sequence(tyro.MISSING, tyro.MISSING, preset=name, reconstructor=reconstructor)  # type: ignore[arg-type]
+    default = Sequence(tyro.MISSING, tyro.MISSING, preset=name, reconstructor=reconstructor)
     if not (run(read_settings(default, arguments, "sequence")).status == DONE).any():
         raise SystemExit(1)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -16,7 +17,7 @@ from jaxtyping import Float
 from nerif.common.conventions import FACES, InputError
 from nerif.common.files import check_known
 from nerif.common.settings import Positive, check_settings
-from nerif.geometry import Projection, projection_named
+from nerif.geometry import PROJECTIONS, Projection, projection_named
 from nerif.imaging.calibration.bundle import COEFFICIENTS, Bundle, Observation, Pose, adjust, crossing
 from nerif.imaging.calibration.first_guess import first_guess, mirror
 from nerif.imaging.calibration.result import Calibration
@@ -35,7 +36,7 @@ INITIAL_NOISE, MIN_NOISE = 0.1, 1e-4  # px, of a point: before it is estimated; 
 class CalibrationSettings:
     """Settings of a calibration from target images."""
 
-    projection: str = "perspective"
+    projection: Literal[*PROJECTIONS] = "perspective"  # type: ignore[valid-type]
     """Projection of all cameras: perspective or telecentric."""
     distortion: tuple[str, ...] = ("k1", "k2", "p1", "p2")
     """Distortion coefficients to determine, from k1 k2 p1 p2 k3; the others are 0."""

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from nerif.common.conventions import InputError
+from nerif.common.settings import check_settings
 
 __all__ = ["KINDS", "CalibrationTarget", "Detection", "ViewImages", "eight_bit", "saddle_points"]
 
@@ -70,7 +71,7 @@ class CalibrationTarget:
     single camera, or where all cameras are upright.
     """
 
-    kind: str = "charuco"
+    kind: Literal[*KINDS] = "charuco"  # type: ignore[valid-type]
     """chessboard, charuco or circles (a regular grid of black dots)."""
     columns: int = 12
     """Number of squares (circles: dots) along a row."""
@@ -86,8 +87,7 @@ class CalibrationTarget:
     """ChArUco board in the layout of OpenCV before version 4.6."""
 
     def __post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise InputError(f"expected one of {', '.join(KINDS)}, got '{self.kind}'", field="target kind")
+        check_settings(self)
         size, minimum = f"{self.columns} x {self.rows}", 2 if self.kind == "circles" else 4
         if self.columns < minimum or self.rows < minimum:
             raise InputError(f"expected at least {minimum} columns and rows, got {size}", field="target")

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 from annotated_types import Ge, Lt
@@ -45,7 +45,7 @@ MEGAPIXEL = 2**20  # in images up to this number of pixels
 class DisplacementSettings:
     """Settings of the displacement measurement."""
 
-    method: str = "correlation"
+    method: Literal[*FLOWS] = "correlation"  # type: ignore[valid-type]
     """correlation (windows of 12 px x smoothness; best on dots), dis (fast, good on noise), deepflow (the paper's),
     ilk, tvl1."""
     smoothness: Positive = 1.0
@@ -60,8 +60,6 @@ class DisplacementSettings:
     """Pixels with a lower local correlation of flow image and warped reference are not valid."""
 
     def __post_init__(self) -> None:
-        if self.method not in FLOWS:
-            raise InputError(f"expected one of {', '.join(FLOWS)}, got '{self.method}'", field="method")
         check_settings(self)
 
     @property

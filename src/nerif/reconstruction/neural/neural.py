@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 from nerif.data.measurement import Measurement
 from nerif.fields.base import Field
@@ -17,6 +18,8 @@ __all__ = ["NeRIF"]
 @dataclass(frozen=True)
 class NeRIF(TrainingSettings):
     """Neural refractive index field."""
+
+    title: ClassVar[str] = "NeRIF"
 
     def __call__(
         self,

@@ -11,7 +11,7 @@ from annotated_types import Ge, Gt
 from nerif.common.conventions import InputError
 from nerif.common.settings import NonNegative, Positive
 from nerif.fields.network import NetworkShape
-from nerif.forward.registry import AUTO, check_model
+from nerif.forward.registry import AUTO, MODEL_NAMES
 from nerif.geometry.symmetry import NO_SYMMETRY
 from nerif.reconstruction.neural.losses import LossWeights
 from nerif.reconstruction.shared_settings import SHORT_RUN, SharedSettings, Source
@@ -34,7 +34,7 @@ class TrainingSettings(SharedSettings):
     """Weights of the loss terms."""
     norm: Literal["l2", "squared"] = "squared"
     """Loss of residuals: squared (maximum likelihood of Gaussian noise), or l2, their length (paper)."""
-    model: str = AUTO
+    model: Literal[*MODEL_NAMES] = AUTO  # type: ignore[valid-type]
     """Forward model. Displacements: lever_arm (auto), paraxial, or curved (along bent rays). Absorption: absorbance
     (auto), intensity (uniform detector noise) or poisson (photon counts), both for low transmission."""
     samples: tuple[int, int] = (0, 0)
@@ -109,7 +109,6 @@ class TrainingSettings(SharedSettings):
             )
         if (self.weights.head or self.weights.consistency) and not self.network.gradient_head:
             raise InputError("the head and consistency terms need gradient_head = true", field="weights")
-        check_model(self.model)
 
     def resolved_by(self, measurement: Measurement) -> TrainingSettings:
         """Return the settings with the encoding and the samples per ray that suit a measurement."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import ClassVar
 
 from torch import Tensor
 
@@ -29,6 +30,7 @@ class Landweber(VoxelReconstructor):
     O'Donoghue & Candes, Found. Comput. Math. 15 (2015).
     """
 
+    title: ClassVar[str] = "Landweber"
     momentum: bool = True
     """Nesterov's momentum: the same accuracy in far fewer iterations."""
     relaxation: float = 1.0

@@ -12,6 +12,7 @@ import math
 from abc import abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float
@@ -76,6 +77,7 @@ class MLEM(Multiplicative):
     J. Comput. Assist. Tomogr. 8 (1984) 306.
     """
 
+    title: ClassVar[str] = "MLEM"
     iterations: int = 100
     """Maximum iterations."""
 
@@ -94,6 +96,7 @@ class MART(Multiplicative):
     Oudheusden, Exp. Fluids 41 (2006) 933; by blocks: Byrne, IEEE Trans. Image Process. 2 (1993) 96.
     """
 
+    title: ClassVar[str] = "MART"
     relaxation: float = 1.0
     """Exponent mu; above 0, at most 1."""
     iterations: int = 10

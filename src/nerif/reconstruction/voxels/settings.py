@@ -18,7 +18,7 @@ from torch import Tensor
 from nerif.common.settings import Count, NonNegative
 from nerif.data.measurement import Measurement
 from nerif.fields.base import Field
-from nerif.forward.registry import AUTO, check_model
+from nerif.forward.registry import AUTO, MODEL_NAMES
 from nerif.geometry import Grid
 from nerif.reconstruction.base import OnStep, Reconstruction, State
 from nerif.reconstruction.shared_settings import SHORT_RUN, SharedSettings, Source
@@ -44,7 +44,7 @@ class VoxelReconstructor(SharedSettings):
     """Voxels along the longest edge of the box, in the reconstruction and in the written volume."""
     basis: Literal["linear", "cubic"] = "cubic"
     """Interpolation between voxel centres: cubic B-splines, or trilinear (less accurate, slightly faster)."""
-    model: str = AUTO
+    model: Literal[*MODEL_NAMES] = AUTO  # type: ignore[valid-type]
     """Linear forward model of displacements: lever_arm (auto) or paraxial."""
     source: Source = "auto"
     """Data to fit (also --from): displacements, images (pixel by pixel, linearised about the displacements), both, or
@@ -66,7 +66,6 @@ class VoxelReconstructor(SharedSettings):
         super().__post_init__()
         if self.step is not None:
             check_step(self.step, self.basis)
-        check_model(self.model)
 
     def in_two(self) -> tuple[VoxelReconstructor, VoxelReconstructor]:
         voxels = max(min(MIN_VOXELS, self.voxels), self.voxels // 2)

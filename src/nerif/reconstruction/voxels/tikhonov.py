@@ -7,11 +7,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 from torch import Tensor
 
-from nerif.common.conventions import InputError
 from nerif.reconstruction.voxels.problem import Iterate, Penalty, Problem, minimise
 from nerif.reconstruction.voxels.settings import WeightedVoxelReconstructor
 
@@ -25,13 +24,9 @@ class Tikhonov(WeightedVoxelReconstructor):
     Source: Tikhonov & Arsenin (1977); for BOST: Nicolas et al., Exp. Fluids 57:13 (2016).
     """
 
-    penalty: Literal["identity", "gradient", "laplacian"] = "gradient"
+    title: ClassVar[str] = "Tikhonov"
+    penalty: Literal[*Penalty.KINDS] = "gradient"  # type: ignore[valid-type]
     """Quantity that is penalised: the field, its gradient, or its Laplacian."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.penalty not in Penalty.KINDS:
-            raise InputError(f"expected one of {', '.join(Penalty.KINDS)}, got '{self.penalty}'", field="penalty")
 
     def iterate(self, problem: Problem, x: Tensor, weight: float) -> Iterator[Iterate]:
         yield from minimise(problem, Penalty(problem, self.penalty), weight, x)

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import reduce
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float
@@ -30,6 +31,7 @@ class TotalVariation(WeightedVoxelReconstructor):
     Source: Rudin, Osher & Fatemi, Physica D 60 (1992); Rodriguez & Wohlberg, IEEE Trans. Image Process. 18 (2009).
     """
 
+    title: ClassVar[str] = "total variation"
     softness: float = 0.1
     """Gradient, in units of the field's own scale per box edge, below which the penalty is quadratic."""
     round: int = 10
