@@ -41,7 +41,7 @@ def test_withheld_pixels_are_in_no_batch(measurement):
 def test_without_withheld_pixels_the_loss_decides(measurement):
     valid = torch.zeros_like(measurement.usable)
     valid[:, 10, 10] = True
-    result = replace(ENDLESS, first_cycle=10, longest=3.0)(replace(measurement, valid=valid))
+    result = replace(ENDLESS, first_cycle=10)(replace(measurement, valid=valid))
     assert result.outcome.message.startswith("residual ")
     assert "withheld" not in result.outcome.message
 
@@ -67,17 +67,6 @@ def test_a_run_converges_and_resumes(measurement, ball, tmp_path, monkeypatch):
     assert finished.outcome.message == whole.outcome.message
     assert len(finished.history) == len(whole.history)
     assert torch.equal(finished.field(points), whole.field(points))
-
-
-@pytest.mark.slow
-def test_the_longest_time_ends_a_run_and_more_time_continues_it(measurement):
-    short = replace(ENDLESS, longest=0.5, first_cycle=10**6)(measurement)
-    assert short.outcome.reason == "time_limit"
-    assert "--time-limit" in short.outcome.message
-    assert 0.4 < short.seconds < 10
-    again = replace(ENDLESS, longest=short.seconds + 0.3, first_cycle=10**6)(measurement, resume=short.state)
-    assert again.outcome.reason == "time_limit"
-    assert again.history[-1]["step"] > short.history[-1]["step"]
 
 
 def test_a_run_that_had_a_limit_continues_with_a_cycle(measurement):
@@ -119,7 +108,7 @@ def test_the_result_is_that_of_the_best_cycle(measurement, monkeypatch, first, r
         assert not torch.equal(values, last)
 
 
-@pytest.mark.parametrize(("setting", "value"), [("longest", 0.0), ("first_cycle", 0), ("longest", math.nan)])
+@pytest.mark.parametrize(("setting", "value"), [("first_cycle", 0), ("time_limit", math.nan)])
 def test_invalid_limits_are_refused(setting, value):
     with refused(setting):
         NeRIF(**{setting: value})

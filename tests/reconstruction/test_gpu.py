@@ -113,7 +113,7 @@ def test_projections_are_on_the_device_of_the_rays(measurement, ball, gpu):
 
 
 SHAPE = NetworkShape(depth=2, width=8, octaves=2, skip=1, head_width=4, gradient_head=True)
-SMALL = {"device": str(GPU), "compile": "off", "max_steps": 6, "samples": (6, 8), "sample_jitter": 1, "longest": 60.0}
+SMALL = {"device": str(GPU), "compile": "off", "max_steps": 6, "samples": (6, 8), "sample_jitter": 1}
 SMALL |= {"points_per_batch": 400, "epochs": 0.0, "stop_ratio": 0.0}
 RUNS = {name: replace(p, network=SHAPE, **SMALL) for name, p in PRESETS.items()}
 RUNS["curved"] = replace(RUNS["fast"], model="curved")

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn import Module
 
 from nerif.common.conventions import InputError
 from nerif.common.pauses import pause
@@ -30,6 +31,7 @@ from nerif.reconstruction.voxels.symmetric_operator import project_spline
 
 VOXEL_STEP = {"linear": 0.1, "cubic": 0.25}  # voxels between samples
 SAMPLES = 80  # per ray; error 0.06 % of the rms displacement for a network fitted to the flame
+GRADIENT_COST = 3.0
 EXACT_WORK = {"cpu": 2.5e11, "cuda": 2.5e13}  # multiplications: ten seconds on two cores
 SPLINE_VOXELS, SPLINE_MARGIN = 100, 3  # along the longest edge of the box, and beyond each face
 SYMMETRIC_VOXELS = 400  # along the longest edge of (r, h)
@@ -194,10 +196,21 @@ def _work(field: Field, cameras: Sequence[Camera]) -> float:
     """Multiplications of the path integral through a network on every pixel; 0 for other fields."""
     if not isinstance(field, NeuralField):
         return 0.0
-    weights = sum(p.numel() for p in field.network.parameters())
+    return sum(p.numel() for p in field.network.parameters()) * _points(cameras)
+
+
+def _points(cameras: Sequence[Camera]) -> float:
+    """Samples along the rays of all pixels."""
     samples = [SAMPLES * (1 if c.lens is None else LENS_RAYS / 2) for c in cameras]
-    pixels = [c.image_size[0] * c.image_size[1] for c in cameras]
-    return float(weights) * sum(n * m for n, m in zip(samples, pixels, strict=True))
+    return sum(n * c.image_size[0] * c.image_size[1] for n, c in zip(samples, cameras, strict=True))
+
+
+def evaluations(network: Module, cameras: Sequence[Camera], box: Box, device: torch.device | str = "cpu") -> float:
+    """Return how many evaluations of a network `reproject` takes; value and gradient count as GRADIENT_COST of them."""
+    points = _points(cameras)
+    if sum(p.numel() for p in network.parameters()) * points <= EXACT_WORK[torch.device(device).type]:
+        return GRADIENT_COST * points
+    return float(math.prod(_extended(Grid.of_resolution(box, SPLINE_VOXELS), (0, 1, 2)).shape))
 
 
 def on_voxels(field: Field, box: Box, device: torch.device | str = "cpu") -> VoxelField | SymmetricVoxels:

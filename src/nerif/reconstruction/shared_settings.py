@@ -50,7 +50,7 @@ class SharedSettings(Reconstructor):
     axis_sigma_deg: NonNegative = 2.0
     """Standard deviation of the tilt of the axis, degrees (0: fixed)."""
     time_limit: NonNegative = 0.0
-    """Time limit in seconds (0: none)."""
+    """Time limit in seconds (0: none); of nerif reconstruct it counts everything from the start to the report."""
     lower: float | None = None
     """Lower bound of the field, such as -2.7e-4 for the index excess of hot gas (default: that of the technique)."""
     upper: float | None = None

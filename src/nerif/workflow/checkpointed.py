@@ -35,7 +35,7 @@ class CheckpointedRun:
     checkpoint_every : s
     monitor : of the progress
     restart : whether to ignore the content of the directory
-    limits : names of settings that may differ when a run is resumed
+    limits : names of settings that may differ when a run is resumed, beside the time limit
     """
 
     directory: ResultDirectory
@@ -102,6 +102,6 @@ class CheckpointedRun:
     def _inputs(self) -> str:
         """Settings, data and further inputs as text."""
         settings = dataclasses.asdict(self.reconstructor)  # type: ignore[call-overload]
-        settings = {name: value for name, value in settings.items() if name not in self.limits}
+        settings = {name: value for name, value in settings.items() if name not in (*self.limits, "time_limit")}
         inputs = {"data": fingerprint(self.data), **self.dependencies, **settings}
         return json.dumps(inputs, indent=1, default=str) + "\n"

@@ -28,7 +28,7 @@ AUTO: tuple[str, ...] = ("auto",)
 NONE: tuple[str, ...] = ("none",)
 """Values of `withhold` other than names of views: cross-validation with one view, and no withheld view."""
 MIN_VIEWS = 4  # with three, the other two constrain the field too little
-LIMITS = ("epochs", "max_steps", "time_limit", "longest", "iterations")
+LIMITS = ("epochs", "max_steps", "iterations")
 SCORES = "views.json"
 
 

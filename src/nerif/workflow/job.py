@@ -23,7 +23,7 @@ from nerif.reconstruction.files import CHECKPOINT, FIELD
 from nerif.reconstruction.methods import method_name
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.neural.parallel import Ranks
-from nerif.reconstruction.neural.schedule import SlowRun
+from nerif.reconstruction.neural.schedule import Pace
 from nerif.reconstruction.progress import QUIET, Monitor
 from nerif.reconstruction.shared_settings import SharedSettings
 from nerif.reconstruction.sources import check_source
@@ -32,6 +32,7 @@ from nerif.reconstruction.uncertainty.bootstrap import KINDS, Trials
 from nerif.reconstruction.voxels.settings import VoxelReconstructor
 from nerif.results.directory import ResultDirectory
 from nerif.results.live import Live
+from nerif.workflow.budget import Budget
 from nerif.workflow.cross_validation import AUTO, MIN_VIEWS, CrossValidation, with_halves
 
 __all__ = ["Inputs", "Job", "Run", "remedy"]
@@ -147,7 +148,7 @@ class Job:
         self, out: ResultDirectory, measurement: Measurement | str | os.PathLike[str], reconstructor: Reconstructor,
         run: Run, *, voxels: int | None = None, resume: bool = False, force: bool = False,
         keep: Mapping[str, Any] | None = None, on_step: OnStep | None = None, monitor: Monitor = QUIET,
-        live: bool = False,
+        live: bool = False, since: float | None = None,
     ) -> None:  # fmt: skip
         self.out, self.resume, self.on_step = out, resume, on_step
         self.inputs, self.reconstructor = Inputs.of(measurement, reconstructor, run)
@@ -156,11 +157,12 @@ class Job:
         if voxels < 1:
             raise InputError(f"expected 1 or more, got {voxels}", field="voxels")
         self.voxels, self.trials = voxels, Trials(run.uncertainty)
+        self.budget = Budget.of(self.reconstructor, self.inputs.training, voxels, since)
         self.run = replace(run, gas=run.gas.for_measurement(self.inputs.measurement))
         for line in self.inputs.remarks:
             monitor.say(line)
-        slow = SlowRun(self.reconstructor, monitor.say)
-        self.monitor = monitor.telling(slow)
+        pace = Pace(self.reconstructor, monitor.say)
+        self.monitor = monitor.telling(pace)
         self.validation = self._cross_validation()
         continued = self.validation is None or out.has(CHECKPOINT) or not self.validation.resumable
         self.state: State | None = out.state() if resume and continued else None
@@ -177,7 +179,7 @@ class Job:
         self.view: Live | None = None
         if live and self.ranks.is_first:
             data = self.measurement if self.validation is None else self.validation.data
-            self.view = Live(out.path, data, self.reconstructor, next(iter(self.withheld), ""), lambda: slow.line)
+            self.view = Live(out.path, data, self.reconstructor, next(iter(self.withheld), ""), lambda: pace.warning)
         if self.validation is not None:
             self.validation = replace(self.validation, monitor=self.watching(withheld=True))
 

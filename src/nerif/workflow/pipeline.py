@@ -33,6 +33,7 @@ def reconstruct_into(
     on_step: OnStep | None = None,
     monitor: Monitor = QUIET,
     live: bool = False,
+    since: float | None = None,
 ) -> Reconstruction:
     """Reconstruct, and write the result directory of docs/formats.md.
 
@@ -52,13 +53,14 @@ def reconstruct_into(
     on_step : called after each step of the main reconstruction, and may stop it
     monitor : of the progress
     live : write live.json and live.npz during the run (results/live.py)
+    since : time from which the time limit counts, s since the epoch; None for now
     """
     out, jobs = ResultDirectory(directory, monitor.say), list[Job]()
     own_files = lambda: resume or any(job.begun for job in jobs)  # noqa: E731
     with Cores(torch.device("cpu")), if_interrupted(lambda: remedy(out, own_files())):
         job = Job(
             out, measurement, reconstructor, run or Run(), voxels=voxels, resume=resume, force=force, keep=keep,
-            on_step=on_step, monitor=monitor, live=live,
+            on_step=on_step, monitor=monitor, live=live, since=since,
         )  # fmt: skip
         jobs.append(job)
         run_steps(job)

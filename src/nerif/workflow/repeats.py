@@ -17,6 +17,7 @@ from nerif.reconstruction.base import Reconstruction, Reconstructor
 from nerif.reconstruction.progress import QUIET, Monitor
 from nerif.reconstruction.uncertainty.bootstrap import Deviations, Maps, Original, Trials, certainty
 from nerif.results.directory import ResultDirectory
+from nerif.workflow.budget import NO_LIMIT, Budget
 from nerif.workflow.checkpointed import CheckpointedRun
 
 __all__ = ["Members", "all_quantities"]
@@ -41,6 +42,7 @@ class Members:
     dependencies : further inputs; a trial with others is repeated
     checkpoint_every : s
     monitor : of the progress
+    budget : time left for the trials
     """
 
     out: ResultDirectory
@@ -51,6 +53,7 @@ class Members:
     dependencies: Mapping[str, str] = field(default_factory=dict)
     checkpoint_every: float = 60.0
     monitor: Monitor = QUIET
+    budget: Budget = NO_LIMIT
 
     def add_to(self, main: Reconstruction, gas: GasSettings, voxels: int) -> None:
         """Run the trials, and write standard deviations of every quantity beside the main result.
@@ -65,8 +68,9 @@ class Members:
         diverged = []
         for number in range(1, count + 1):
             member = self.trials.member(number, base)
+            settings = self.budget.allot(member.reconstructor, 1 / (count - number + 1))
             run = CheckpointedRun(
-                self.out.member(number), member.reconstructor, member.measurement, self.start, self.dependencies,
+                self.out.member(number), settings, member.measurement, self.start, self.dependencies,
                 self.checkpoint_every, self.monitor,
             )  # fmt: skip
             result = run(f"trial {number} of {count}")

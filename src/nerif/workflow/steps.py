@@ -24,6 +24,7 @@ from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.rig.parameters import refinement_lines, with_corrections
 from nerif.reconstruction.rig.posterior import with_posterior
 from nerif.reconstruction.rig.refinement import refit
+from nerif.reconstruction.shared_settings import SHORT_RUN
 from nerif.results.directory import CALIBRATION, versions
 from nerif.results.metrics import Metrics
 from nerif.workflow.job import Job
@@ -65,6 +66,8 @@ class CrossValidate(PipelineStep):
     @staticmethod
     def run(job: Job) -> None:
         assert job.validation is not None
+        settings = job.budget.allot(job.validation.reconstructor, 1 / (1 + SHORT_RUN + job.trials.members))
+        job.validation = replace(job.validation, reconstructor=settings)
         short = job.validation(job.begin)
         if short is None:
             return
@@ -91,7 +94,8 @@ class Fit(PipelineStep):
             if job.on_step is not None:
                 callbacks.append(job.on_step)
             initial = job.initial if job.state is None else None
-            job.result = job.method(job.inputs.training, compose(*callbacks), job.state, initial)
+            method = job.budget.allot(job.method, 1 / (1 + job.trials.members))
+            job.result = method(job.inputs.training, compose(*callbacks), job.state, initial)
 
 
 class WriteField(PipelineStep):
@@ -218,7 +222,7 @@ class Bootstrap(PipelineStep):
         monitor = job.watching(withheld=False, looks=False)
         members = Members(
             job.out, job.trials, job.reconstructor, corrected, job.start, dependencies, job.run.checkpoint_every,
-            monitor,
+            monitor, job.budget,
         )  # fmt: skip
         members.add_to(result, job.run.gas, job.voxels)
 

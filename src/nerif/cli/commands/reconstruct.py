@@ -10,6 +10,7 @@ from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import psutil
 import tyro
 
 from nerif.cli.commands.help import grouped_help
@@ -99,7 +100,7 @@ def run(settings: Reconstruct) -> Reconstruction:
         return reconstruct_into(
             settings.out, settings.measurement, settings.reconstructor, settings.run,
             voxels=getattr(settings, "voxels", None), resume=settings.resume, force=settings.force, keep=attributes,
-            on_step=scalars, monitor=MONITOR, live=settings.live,
+            on_step=scalars, monitor=MONITOR, live=settings.live, since=psutil.Process().create_time(),
         )  # fmt: skip
 
 

@@ -110,7 +110,7 @@ class Convergence(Callback):
         error = self._error(trainer)
         noise = float(withheld is not None and withheld.sigma_known)
         label = "residual" if withheld is None else "residual of withheld pixels"
-        outcome = cycles.end(error, noise, schedule.step, schedule.seconds, label)
+        outcome = cycles.end(error, noise, schedule.step, label)
         trainer.history.log(trainer, {"withheld_residual": math.sqrt(error)})
         if cycles.best:
             self.best_weights, self.best_data = trainer.weights(), trainer.data.state_dict()

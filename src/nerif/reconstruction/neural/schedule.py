@@ -28,7 +28,7 @@ from nerif.reconstruction.base import Outcome, Reconstructor, Step
 from nerif.reconstruction.neural.parallel import Ranks
 from nerif.reconstruction.neural.settings import TrainingSettings
 
-__all__ = ["Cycles", "Schedule", "SlowRun", "duration"]
+__all__ = ["Cycles", "Pace", "Schedule", "duration"]
 
 
 class Resumable:
@@ -55,25 +55,32 @@ MAX_CYCLES = 6
 
 
 class Cycles(Resumable):
-    """The cycles of a run without a limit: `first` steps in the first, at most `longest` seconds in all."""
+    """The cycles of a run without a limit; `first` steps in the first."""
 
-    STATE = ("length", "step", "seconds", "errors", "verdict")
+    STATE = ("length", "step", "errors", "verdict")
 
-    def __init__(self, first: int, longest: float) -> None:
-        self.length, self.longest = first, longest
-        self.step, self.seconds = 0, 0.0  # at which the present cycle began
+    def __init__(self, first: int) -> None:
+        self.first, self.length = first, first
+        self.step = 0  # at which the present cycle began
         self.errors: list[float] = []
         self.verdict = ""  # why the run has converged
 
-    def progress(self, step: int, seconds: float) -> float:
-        """Return the share of the present cycle: 0 at its start, 1 at its end."""
-        left = self.longest - self.seconds
-        return max((step - self.step) / self.length, (seconds - self.seconds) / left if left > 0 else 1.0)
+    @property
+    def least_steps(self) -> int:
+        """Steps of a run that converges as soon as possible."""
+        return self.first * (2 ** (PATIENCE + 1) - 1)
 
-    def end(
-        self, error: float, noise: float, step: int, seconds: float, label: str = "residual of withheld pixels"
-    ) -> Outcome | None:
-        """End a cycle at a step and time of the run: begin the next, or return why there is none.
+    @property
+    def most_steps(self) -> int:
+        """Steps of all cycles."""
+        return self.first * (2**MAX_CYCLES - 1)
+
+    def progress(self, step: int) -> float:
+        """Return the share of the present cycle: 0 at its start, 1 at its end."""
+        return (step - self.step) / self.length
+
+    def end(self, error: float, noise: float, step: int, label: str = "residual of withheld pixels") -> Outcome | None:
+        """End a cycle at a step of the run: begin the next, or return why there is none.
 
         Parameters
         ----------
@@ -81,16 +88,13 @@ class Cycles(Resumable):
         """
         self.errors.append(error)
         before, least = min(self.errors[:-PATIENCE], default=math.inf), min(self.errors[-PATIENCE:])
-        length, duration_s = self.length, seconds - self.seconds
-        self.step, self.seconds, self.length = step, seconds, 2 * length
+        length = self.length
+        self.step, self.length = step, 2 * length
         level = f"{label} {math.sqrt(min(self.errors)):.3g}{' sigma' if noise else ''}"
         if before - least <= max(FALL * (least - noise), SCATTER * least):
             self.verdict = f"{level}, not reduced by the last {length + length // 2} steps"
         elif len(self.errors) == MAX_CYCLES:
             self.verdict = f"{level} after {MAX_CYCLES} cycles, the maximum"
-        elif seconds + duration_s > self.longest:
-            message = f"{level} after {seconds:.0f} s; --time-limit {4 * seconds:.0f} may reduce it"
-            return Outcome("time_limit", message)
         return self.outcome
 
     @property
@@ -125,7 +129,7 @@ class Schedule:
     def __init__(self, settings: TrainingSettings, rays: int, ranks: Ranks, device: torch.device) -> None:
         self.settings, self.rays, self.ranks, self.device = settings, rays, ranks, device
         self.step, self.rays_done, self.ray_count, self.rate_factor = 0, 0, 0, 1.0
-        self.cycles = None if settings.limited else Cycles(settings.first_cycle, settings.longest)
+        self.cycles = None if settings.limited else Cycles(settings.first_cycle)
         self._before, self._start, self._synchronised = 0.0, time.perf_counter(), 0.0
         self.restart_pace()
 
@@ -170,7 +174,7 @@ class Schedule:
     def progress(self) -> float:
         """0 at the start, 1 at the first limit or at the end of a cycle."""
         if self.cycles is not None:
-            return self.cycles.progress(self.step, self.seconds)
+            return self.cycles.progress(self.step)
         shares = [self.epoch / self.settings.epochs] if self.settings.epochs else []
         return max(shares + self._shares())
 
@@ -183,7 +187,7 @@ class Schedule:
     @property
     def share(self) -> float:
         """Smallest possible share of the run: 0 at the start, 1 at the latest end."""
-        return self.progress if self.cycles is None else self.seconds / self.cycles.longest
+        return self.progress if self.cycles is None else self.step / self.cycles.most_steps
 
     def count(self, rays: int) -> None:
         """Count the rays of a step."""
@@ -213,9 +217,9 @@ class Schedule:
             return Outcome("epochs", f"all {settings.epochs:g} epochs done")
         if settings.max_steps and self.step >= settings.max_steps:
             return Outcome("steps", f"all {settings.max_steps} steps done; a larger --max-steps may reduce the error")
-        if self.seconds >= settings.latest:
-            message = f"stopped at the {settings.latest:g} s time limit; a longer run may reduce the error"
-            return Outcome("time_limit", message)
+        if settings.time_limit and self.seconds >= settings.time_limit:
+            message = f"stopped at the time limit, after {self.seconds:.0f} s of training"
+            return Outcome("time_limit", f"{message}; a longer run may reduce the error")
         return None if self.cycles is None else self.cycles.outcome
 
     def set_rays(self, rays: int) -> None:
@@ -239,24 +243,24 @@ class Schedule:
         self._before, self._start = float(state["seconds"]), time.perf_counter()
         self.restart_pace()
         if self.cycles is not None:
-            self.cycles.load_state_dict(state.get("cycles", {"step": self.step, "seconds": self._before}))
+            self.cycles.load_state_dict(state.get("cycles", {"step": self.step}))
 
 
 MIN_RUN = 100  # steps without which no field is found
 PACE_STEPS, PACE_SHARE = 5, 0.05  # steps, or share of the time limit, after which the pace is known
 
 
-class SlowRun:
-    """Callback that warns once if the time limit allows too few steps.
+class Pace:
+    """Callback that states once how long a run will take, or that its time limit allows too few steps.
 
-    The first step does not count, since it may compile the network. Methods without a network have no warning.
+    The first step does not count, since it may compile the network. Methods without a network have no pace.
     """
 
     def __init__(self, settings: Reconstructor, say: Callable[[str], None]) -> None:
         self.settings, self.say = settings, say
-        self.line = ""  # the warning
+        self.warning = ""  # that there is too little time
         self._first: Step | None = None
-        self._done = not isinstance(settings, TrainingSettings) or math.isinf(settings.latest)
+        self._done = not isinstance(settings, TrainingSettings)
 
     def __call__(self, step: Step) -> None:
         settings, first = self.settings, self._first
@@ -266,21 +270,36 @@ class SlowRun:
         if first is None or step.step <= first.step:  # another run has begun
             self._first = step
             return
-        limit, steps, seconds = settings.latest, step.step - first.step, step.seconds - first.seconds
+        steps, seconds = step.step - first.step, step.seconds - first.seconds
+        limit = settings.time_limit or math.inf
         if steps < PACE_STEPS and seconds < PACE_SHARE * limit:
             return
         self._done = True
-        pace, planned = seconds / steps, settings.steps(step.pass_steps)
-        possible = first.step + (limit - first.seconds) / max(pace, 1e-9)
-        if possible >= min(MIN_RUN, planned):
-            return
-        count, plan = (planned, "planned steps") if math.isfinite(planned) else (MIN_RUN, "steps")
-        self.line = (
-            f"slow: {duration(pace)} per step, so the time limit of {duration(limit)} allows about {possible:.0f} "
-            f"steps; {count:.0f} {plan} would take {duration(count * pace)}. Give a longer --time-limit, or fewer "
-            "--points-per-batch and a smaller --network.width (--preset fast suits a CPU)"
-        )
-        self.say(self.line)
+        pace, planned = max(seconds / steps, 1e-9), settings.steps(step.pass_steps)
+        possible = first.step + (limit - first.seconds) / pace
+        if possible < min(MIN_RUN, planned):
+            self.warning = _too_slow(pace, limit, possible, planned)
+            self.say(self.warning)
+        elif not settings.time_limit:
+            self.say(_forecast(settings, pace, planned))
+
+
+def _too_slow(pace: float, limit: float, possible: float, planned: float) -> str:
+    count, plan = (planned, "planned steps") if math.isfinite(planned) else (MIN_RUN, "steps")
+    return (
+        f"slow: {duration(pace)} per step, so the time limit of {duration(limit)} allows about {possible:.0f} "
+        f"steps; {count:.0f} {plan} would take {duration(count * pace)}. Give a longer --time-limit, or fewer "
+        "--points-per-batch and a smaller --network.width (--preset fast suits a CPU)"
+    )
+
+
+def _forecast(settings: TrainingSettings, pace: float, planned: float) -> str:
+    if math.isfinite(planned):
+        return f"{planned:.0f} steps of training take about {duration(planned * pace)} here"
+    cycles = Cycles(settings.first_cycle)
+    least, most = cycles.least_steps, cycles.most_steps
+    times = f"about {duration(least * pace)} to {duration(most * pace)}"
+    return f"training converges after {least} to {most} steps, {times} here; Ctrl-C ends it earlier and keeps the field"
 
 
 def duration(seconds: float) -> str:

@@ -74,8 +74,6 @@ class TrainingSettings(SharedSettings):
     on withheld rays stops falling."""
     max_steps: Annotated[int, Ge(0)] = 0
     """Limit in steps (0: none)."""
-    longest: Positive = 600.0
-    """Time limit in seconds of a run without any other limit (not of sequences)."""
     first_cycle: Annotated[int, Gt(0)] = 400
     """Steps before the first convergence check of a run without a limit; doubled after each check."""
     stop_ratio: NonNegative = 0.0
@@ -129,11 +127,6 @@ class TrainingSettings(SharedSettings):
         )
         short = replace(self, epochs=SHORT_RUN * self.epochs, max_steps=steps, time_limit=SHORT_RUN * self.time_limit)
         return short, replace(self, rate_after_fit=1.0)  # a short run ends too early for a reduced rate
-
-    @property
-    def latest(self) -> float:
-        """Time limit in seconds, inf if there is none."""
-        return self.time_limit or (math.inf if self.limited else self.longest)
 
     def steps(self, of_pass: float) -> float:
         """Return the limit in steps, inf if there is none; `of_pass`: steps per pass over all rays."""

@@ -267,7 +267,7 @@ class Descent:
         if self.on_step is not None and self.on_step(step):
             raise _Stop("interrupted", f"stopped on request at {voxels:.0f} voxels; continue with --resume")
         if limit and self.seconds >= limit:
-            message = f"stopped at the {limit:g} s time limit, at {voxels:.0f} voxels"
+            message = f"stopped at the time limit, after {self.seconds:.0f} s, at {voxels:.0f} voxels"
             raise _Stop("time_limit", f"{message}; a longer run may reduce the error")
 
     def _progress(self) -> float:

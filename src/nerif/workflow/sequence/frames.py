@@ -81,7 +81,7 @@ def reconstruct_frames(plan: SequencePlan, first: int, last: int, event: Event =
 def _attempts(
     plan: SequencePlan, sequence: MeasurementSequence, index: int, previous: NeuralField | None, watch: OnStep
 ) -> Frame:
-    first = plan.first
+    first = plan.cold
     cautious = replace(first, learning_rate=first.learning_rate / 2)
     attempts = [(first, None) if previous is None else (plan.warm, previous), (first, None), (cautious, None)]
     reason = ""

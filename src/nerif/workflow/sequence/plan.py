@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -78,11 +77,6 @@ class SequencePlan:
     cold: NeRIF
     settings: SequenceSettings = field(default_factory=SequenceSettings)
     threads: int = 0
-
-    @property
-    def first(self) -> NeRIF:
-        """Settings of a frame without an initial field; without a time limit, so that it is reproducible."""
-        return replace(self.cold, longest=math.inf)
 
     @property
     def warm(self) -> NeRIF:
