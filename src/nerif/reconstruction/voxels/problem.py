@@ -124,6 +124,19 @@ class Problem:
         operator = next(operator for operator, p in parts if p.model.name == part.model.name)
         return operator.for_rays(rays, part.model)(x * self.scale)
 
+    def matrix(
+        self, apply: Callable[[Tensor], Tensor], on_voxel: Callable[[int, int], None] = lambda done, total: None
+    ) -> Float[Tensor, "n m"]:
+        """Return a linear operator on fields as a matrix, column by column, for small grids."""
+        one = self.zero()
+        columns = torch.empty(apply(one).numel(), self.voxels, dtype=torch.float64)
+        for i in range(self.voxels):
+            one.view(-1)[i] = 1
+            columns[:, i] = apply(one).flatten()
+            one.view(-1)[i] = 0
+            on_voxel(i + 1, self.voxels)
+        return columns
+
     def pin(self, x: Float[Tensor, "z y x"]) -> Float[Tensor, "z y x"]:
         """Return x with 0, the ambient index, in voxels that are not free."""
         return x if self._free is None else x * self._free
@@ -193,6 +206,10 @@ class Penalty:
             return self.problem.differences.adjoint(self.problem.differences(y[0] * self.root))
         along = tuple(a * factor for a, factor in zip(y, self.factors, strict=True))
         return self.problem.differences.adjoint((along[0], along[1], along[2]))
+
+    def squares(self) -> Float[Tensor, "m m"]:
+        """Return L^T L as a matrix, for small grids."""
+        return self.problem.matrix(lambda x: self.adjoint(self(x)))
 
 
 def minimise(problem: Problem, penalty: Penalty, weight: float, x: Tensor) -> Iterator[Iterate]:
