@@ -84,14 +84,15 @@ class Differences:
 class Problem:
     """The data and the operators on one grid, one for each part of the target.
 
-    `free` voxels are not ambient, None for all; `bounds` are the lowest and highest value of the field, or None.
+    `free` voxels are not ambient, None for all; `bounds` are the lowest and highest value of the field, or None;
+    `pixels` is the problem of single pixels for a target of bins.
     """
 
     def __init__(
         self, operators: Sequence[VoxelOperator], target: Target, free: Bool[Tensor, "z y x"] | None = None,
-        bounds: tuple[float, float] | None = None,
+        bounds: tuple[float, float] | None = None, pixels: Problem | None = None,
     ) -> None:  # fmt: skip
-        self.operators, self.target, self.scale = tuple(operators), target, target.scale
+        self.operators, self.target, self.scale, self.pixels = tuple(operators), target, target.scale, pixels
         self.operator = operator = self.operators[0]
         self.differences = Differences(operator.grid, operator.boundary)
         self.voxels = math.prod(operator.grid.shape)
@@ -117,6 +118,15 @@ class Problem:
     def residual(self, x: Float[Tensor, "z y x"]) -> float:
         """Return |F x - b|^2."""
         return _square(self.data - self.forward(x))
+
+    def pixel_residual(self, iterate: Iterate) -> float:
+        """Return |F x - b|^2 of single pixels."""
+        return iterate.residual if self.pixels is None else self.pixels.residual(iterate.x)
+
+    @property
+    def noise(self) -> float | None:
+        """|F x - b|^2 of single pixels due to noise alone; None where sigma is not known."""
+        return (self.pixels or self).target.noise
 
     def predict(self, part: Part, rays: Rays, x: Float[Tensor, "z y x"]) -> Float[Tensor, "n c"]:
         """Return the projections of x along other rays of the technique of a part."""
