@@ -69,7 +69,6 @@ def find_axis(
     scales = torch.tensor([before[i] for i in refined], dtype=torch.float64)
     edge = max(measurement.box.edges)
     nudges = torch.tensor([NUDGE * edge] * 2 + [NUDGE] * 2, dtype=torch.float64)
-    penalty: Tensor | None = None
 
     def about(t: Float[Tensor, " 4"]) -> Symmetry:
         a, b, c, d = t.tolist()
@@ -85,13 +84,12 @@ def find_axis(
         return torch.cat([e.flatten() for e in each]).double()
 
     data = torch.cat([(p.of_field * p.inverse_scale).flatten() for p in target.parts]).double()
+    squares = Penalty(Problem(operators(values), target), "gradient").squares()
+    penalty = squares / target.scale**2 * WEIGHT * target.numbers
     for _ in range(MAX_STEPS):
-        present = operators(values)
-        if penalty is None:
-            squares = Penalty(Problem(present, target), "gradient").squares()
-            penalty = squares / target.scale**2 * WEIGHT * target.numbers
-        matrices = [o.matrix() * p.inverse_scale[..., None] for o, p in zip(present, target.parts, strict=True)]
-        field = AdaptingField(torch.cat([m.flatten(0, 1).double() for m in matrices]), penalty, RIDGE)
+        present = zip(operators(values), target.parts, strict=True)
+        matrices = [(o.matrix() * p.inverse_scale[..., None]).flatten(0, 1).double() for o, p in present]
+        field = AdaptingField(torch.cat(matrices), penalty, RIDGE)
         c, residual = field.fit(data[:, None])[:, 0], field.rest(data[:, None])[:, 0]
         columns = []
         for i in refined:

@@ -111,19 +111,15 @@ def covariance(
     operators = [VoxelOperator(part.rays, grid, part.model, BASIS, boundary) for part in corrected]
     problem = Problem(operators, replace(target, parts=corrected))
     coefficients = problem.zero() + field.sample(grid, "cpu") / target.scale
-
     views, k = len(rig.cameras), len(rig.columns)
-    root = math.sqrt(target.numbers)
-    columns = torch.zeros(problem.data.numel(), views * k, dtype=torch.float64)
-    first = 0
+    blocks = []
     for part in target.parts:
         view = part.rays.view.long().cpu()
         slopes = rig.slopes(part, lambda part, rays: problem.predict(part, rays, coefficients))[1]
-        slopes = slopes * rig.sigma[:, rig.columns][view][:, None] / root  # (n, c, k)
-        rows = first + torch.arange(slopes.shape[0] * slopes.shape[1]).reshape(slopes.shape[:2])
-        for i in range(k):
-            columns[rows, (view * k + i)[:, None]] = slopes[:, :, i]
-        first += rows.numel()
+        slopes = slopes * rig.sigma[:, rig.columns][view][:, None] / math.sqrt(target.numbers)  # (n, c, k)
+        of_view = torch.nn.functional.one_hot(view, views)[:, None, :, None]
+        blocks.append((slopes[:, :, None] * of_view).reshape(-1, views * k))
+    columns = torch.cat(blocks)
     level = max(1.0, float(residuals(rig, measurement, field, open_faces).square().mean()))
     unit = level / (target.numbers * target.chi_square)  # of one chi-square in the problem's objective
     magnitude = gradient_square(problem.differences(coefficients)).sqrt()

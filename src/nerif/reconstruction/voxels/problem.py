@@ -138,12 +138,10 @@ class Problem:
         self, apply: Callable[[Tensor], Tensor], on_voxel: Callable[[int, int], None] = lambda done, total: None
     ) -> Float[Tensor, "n m"]:
         """Return a linear operator on fields as a matrix, column by column, for small grids."""
-        one = self.zero()
-        columns = torch.empty(apply(one).numel(), self.voxels, dtype=torch.float64)
-        for i in range(self.voxels):
-            one.view(-1)[i] = 1
+        ones = torch.eye(self.voxels).to(self.zero()).reshape(-1, *self.operator.domain_shape)
+        columns = torch.empty(apply(ones[0]).numel(), self.voxels, dtype=torch.float64)
+        for i, one in enumerate(ones):
             columns[:, i] = apply(one).flatten()
-            one.view(-1)[i] = 0
             on_voxel(i + 1, self.voxels)
         return columns
 
