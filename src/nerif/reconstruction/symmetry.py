@@ -24,6 +24,7 @@ from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
 from nerif.geometry.symmetry import Axis, Symmetry, parse_symmetry
 from nerif.reconstruction.gauge import ambient_faces
+from nerif.reconstruction.gauss_newton import AdaptingField, Information
 from nerif.reconstruction.shared_settings import SharedSettings
 from nerif.reconstruction.sources import of_source
 from nerif.reconstruction.target import Target
@@ -39,6 +40,7 @@ MAX_RAYS = 6000
 MAX_STEPS = 12
 CONVERGED = 0.02  # standard deviations: largest change in the last step
 WEIGHT = 1e-4  # of the penalty: too small to bias the axis
+RIDGE = 1e-12  # of the mean curvature, for coefficients that no ray crosses
 NUDGE = 1e-3  # of the longest edge of the box, or rad: step of finite differences
 MIN_ACROSS = math.sin(math.radians(15)) ** 2  # mean square component in the image planes of a direction that is fitted
 AXIS_SIGMA = 0.03  # of the longest edge of the box: default standard deviation of the position
@@ -67,7 +69,6 @@ def find_axis(
     scales = torch.tensor([before[i] for i in refined], dtype=torch.float64)
     edge = max(measurement.box.edges)
     nudges = torch.tensor([NUDGE * edge] * 2 + [NUDGE] * 2, dtype=torch.float64)
-    penalty: Tensor | None = None
 
     def about(t: Float[Tensor, " 4"]) -> Symmetry:
         a, b, c, d = t.tolist()
@@ -83,32 +84,27 @@ def find_axis(
         return torch.cat([e.flatten() for e in each]).double()
 
     data = torch.cat([(p.of_field * p.inverse_scale).flatten() for p in target.parts]).double()
+    squares = Penalty(Problem(operators(values), target), "gradient").squares()
+    penalty = squares / target.scale**2 * WEIGHT * target.numbers
     for _ in range(MAX_STEPS):
-        present = operators(values)
-        if penalty is None:
-            problem = Problem(present, target)
-            penalty = _squares(Penalty(problem, "gradient")) / target.scale**2 * WEIGHT * target.numbers
-        matrices = [o.matrix() * p.inverse_scale[..., None] for o, p in zip(present, target.parts, strict=True)]
-        rows = torch.cat([m.flatten(0, 1).double() for m in matrices])
-        normal = rows.T @ rows + penalty
-        factor = torch.linalg.cholesky(normal + 1e-12 * normal.diagonal().mean() * torch.eye(len(normal)))
-        c = torch.cholesky_solve((rows.T @ data)[:, None], factor)[:, 0]
-        residual = data - rows @ c
+        present = zip(operators(values), target.parts, strict=True)
+        matrices = [(o.matrix() * p.inverse_scale[..., None]).flatten(0, 1).double() for o, p in present]
+        field = AdaptingField(torch.cat(matrices), penalty, RIDGE)
+        c, residual = field.fit(data[:, None])[:, 0], field.rest(data[:, None])[:, 0]
         columns = []
         for i in refined:
             nudge = torch.zeros(4, dtype=torch.float64)
             nudge[i] = nudges[i]
             columns.append((project(values + nudge, c) - project(values - nudge, c)) / (2 * nudges[i]))
         slopes = torch.stack(columns, dim=1) * scales
-        aside = slopes - rows @ torch.cholesky_solve(rows.T @ slopes, factor)
+        aside = field.rest(slopes)
         # variance of the noise in these units; a larger residual counts as noise, too
         level = float(residual.square().mean())
         noise = max(1 / target.chi_square if target.sigma_known else 0.0, level)
-        curvature = slopes.T @ aside / noise + torch.eye(len(refined))
-        pull = aside.T @ residual / noise - values[refined] / scales
-        step = torch.linalg.solve(curvature, pull)
+        information = Information(slopes.T @ aside / noise)
+        step = information.step(aside.T @ residual / noise, values[refined] / scales)
         values[refined] += step * scales
-        after = torch.linalg.inv(curvature).diagonal().sqrt()
+        after = information.covariance.diagonal().sqrt()
         if bool((step.abs() < CONVERGED * after).all()):
             break
     posterior_sigma = torch.tensor(before, dtype=torch.float64)
@@ -132,18 +128,6 @@ def _across(measurement: Measurement, symmetry: Symmetry) -> tuple[Symmetry, tup
 
 def _viewing_directions(measurement: Measurement) -> Float[Tensor, "view 3"]:
     return torch.stack([camera.rotation[2].double() for camera in measurement.cameras])
-
-
-def _squares(penalty: Penalty) -> Float[Tensor, "m m"]:
-    """L^T L as a matrix."""
-    problem = penalty.problem
-    rows = torch.empty(problem.voxels, problem.voxels, dtype=torch.float64)
-    one = problem.zero()
-    for i in range(problem.voxels):
-        one.view(-1)[i] = 1
-        rows[i] = penalty.adjoint(penalty(one)).flatten()
-        one.view(-1)[i] = 0
-    return rows
 
 
 def symmetry_of(settings: SharedSettings, measurement: Measurement) -> Symmetry | None:

@@ -23,12 +23,13 @@ from nerif.data.measurement import Measurement
 from nerif.fields.base import Field
 from nerif.fields.grid import Boundary
 from nerif.forward.path_integral import PathIntegral, project
-from nerif.geometry import Grid, Rays
+from nerif.geometry import Grid
 from nerif.reconstruction.gauge import ambient_faces
+from nerif.reconstruction.gauss_newton import AdaptingField, Information
 from nerif.reconstruction.rig.parameters import RefinedView
 from nerif.reconstruction.rig.refinement import Refinement, random_pixels
 from nerif.reconstruction.sources import of_source
-from nerif.reconstruction.target import Part, Target
+from nerif.reconstruction.target import Target
 from nerif.reconstruction.voxels.levels import bins_of
 from nerif.reconstruction.voxels.operator import VoxelOperator
 from nerif.reconstruction.voxels.problem import Penalty, Problem
@@ -108,51 +109,25 @@ def covariance(
     operators = [VoxelOperator(part.rays, grid, part.model, BASIS, boundary) for part in corrected]
     problem = Problem(operators, replace(target, parts=corrected))
     coefficients = problem.zero() + field.sample(grid, "cpu") / target.scale
-
-    def predict(part: Part, rays: Rays) -> Tensor:
-        operator = next(o for o, p in zip(operators, target.parts, strict=True) if p.model is part.model)
-        return operator.for_rays(rays, part.model)(coefficients * target.scale)
-
     views, k = len(rig.cameras), len(rig.columns)
-    root = math.sqrt(target.numbers)
-    columns = torch.zeros(problem.data.numel(), views * k, dtype=torch.float64)
-    first = 0
+    blocks = []
     for part in target.parts:
         view = part.rays.view.long().cpu()
-        slopes = rig.slopes(part, predict)[1] * rig.sigma[:, rig.columns][view][:, None] / root  # (n, c, k)
-        rows = first + torch.arange(slopes.shape[0] * slopes.shape[1]).reshape(slopes.shape[:2])
-        for i in range(k):
-            columns[rows, (view * k + i)[:, None]] = slopes[:, :, i]
-        first += rows.numel()
+        slopes = rig.slopes(part, lambda part, rays: problem.predict(part, rays, coefficients))[1]
+        slopes = slopes * rig.sigma[:, rig.columns][view][:, None] / math.sqrt(target.numbers)  # (n, c, k)
+        of_view = torch.nn.functional.one_hot(view, views)[:, None, :, None]
+        blocks.append((slopes[:, :, None] * of_view).reshape(-1, views * k))
+    columns = torch.cat(blocks)
     level = max(1.0, float(residuals(rig, measurement, field, open_faces).square().mean()))
     unit = level / (target.numbers * target.chi_square)  # of one chi-square in the problem's objective
     magnitude = gradient_square(problem.differences(coefficients)).sqrt()
     scale = float(magnitude.mean()) / 3  # of gradients with the density exp(-|g| / scale) in three dimensions
     soft = (magnitude.square() + (SOFT * float(magnitude.mean())) ** 2).sqrt()
     penalty = Penalty(problem, "gradient", at_faces(1 / (scale * soft)))
-    response, curvature = _matrices(problem, penalty, on_voxel)
-    normal = response.T @ response + PENALTY_SHARE * unit * problem.voxels * curvature
-    normal.diagonal().add_(RIDGE * float(normal.diagonal().mean()))
-    adaptation = torch.cholesky_solve(response.T @ columns, torch.linalg.cholesky(normal))
-    information = (columns.T @ (columns - response @ adaptation)) / unit
-    values, directions = torch.linalg.eigh(0.5 * (information + information.T))
-    return (directions / (1 + values.clamp(min=0))) @ directions.T
-
-
-def _matrices(
-    problem: Problem, penalty: Penalty, on_voxel: Progress
-) -> tuple[Float[Tensor, "n m"], Float[Tensor, "m m"]]:
-    """F and L^T L, column by column."""
-    response = torch.empty(problem.data.numel(), problem.voxels, dtype=torch.float64)
-    curvature = torch.empty(problem.voxels, problem.voxels, dtype=torch.float64)
-    voxel = problem.zero()
-    for i in range(problem.voxels):
-        voxel.view(-1)[i] = 1
-        response[:, i] = problem.forward(voxel)
-        curvature[:, i] = penalty.adjoint(penalty(voxel)).flatten()
-        voxel.view(-1)[i] = 0
-        on_voxel(i + 1, problem.voxels)
-    return response, curvature
+    curvature = PENALTY_SHARE * unit * problem.voxels * penalty.squares()
+    adapting = AdaptingField(problem.matrix(problem.forward, on_voxel), curvature, RIDGE)
+    information = columns.T @ adapting.rest(columns) / unit
+    return Information(0.5 * (information + information.T)).covariance
 
 
 @torch.no_grad()

@@ -29,6 +29,7 @@ from nerif.fields.base import Field
 from nerif.forward.path_integral import PathIntegral, project
 from nerif.geometry import Box, Camera, Rays
 from nerif.geometry.pose import GEOMETRY, Corrections
+from nerif.reconstruction.gauss_newton import Information
 from nerif.reconstruction.rig.parameters import GROUPS, NAMES, RefinedView, displaced, prior, refined_groups
 from nerif.reconstruction.sources import of_source
 from nerif.reconstruction.target import Part, Target
@@ -205,18 +206,15 @@ class Refinement:
             if not self.off:
                 return
         sigma = self.sigma[:, self.columns]  # 0 for a parameter that a view does not refine: it stays
-        information, directions = torch.linalg.eigh(sigma[:, :, None] * normal * sigma[:, None])
-        pull = torch.einsum("vij,vi->vj", directions, sigma * right)
-        at = torch.einsum("vij,vi->vj", directions, self.values[:, self.columns] / sigma.clamp(min=1e-30))
-        information = information.clamp(min=0)
-        # directions with much information are free of the prior
-        step = ((1 + information) * pull - at) / (1 + information * (1 + information))
-        change = torch.zeros_like(self.values)
-        change[:, self.columns] = sigma * torch.einsum("vij,vj->vi", directions, step)
+        information = Information(sigma[:, :, None] * normal * sigma[:, None])
+        data_weight = 1 + information.values  # directions with much information are free of the prior
+        at, change = self.values[:, self.columns] / sigma.clamp(min=1e-30), torch.zeros_like(self.values)
+        change[:, self.columns] = sigma * information.step(sigma * right, at, data_weight)
         gathered = momentum * self.velocity
         gathered[:, len(GEOMETRY) :] = 0
         self.velocity = gathered + change
-        weights = (information / (1 + information)).clamp(min=MIN_WEIGHT).sqrt()[:, :, None] * directions.mT
+        share = (information.values / data_weight).clamp(min=MIN_WEIGHT)
+        weights = share.sqrt()[:, :, None] * information.directions.mT
         self.values = self._centred(self.values + self.velocity, weights)
 
     def normal_equations(

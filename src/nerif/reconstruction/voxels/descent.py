@@ -24,6 +24,7 @@ from nerif.common.conventions import InputError
 from nerif.common.pauses import pause
 from nerif.data.measurement import Measurement
 from nerif.fields.base import Field
+from nerif.geometry import Grid
 from nerif.reconstruction.aperture import apply_aperture
 from nerif.reconstruction.base import OnStep, Outcome, Reconstruction, State, Step
 from nerif.reconstruction.bounds import field_bounds
@@ -134,49 +135,48 @@ class Descent:
 
     def _descend(self) -> bool:
         """Solve on all levels; return whether the last solution has converged."""
-        while True:
-            problem, pixels = self._problems(self.here)
+        last = len(self.levels) - 1
+        coarse = EARLY_TOLERANCE if self.settings.weight == 0.0 else COARSE_TOLERANCE
+        for level in range(self.level, last + 1):
+            if level > self.level:
+                self.level, self.round, self.iteration = level, 0, 0
+            while self.rig is not None and self.round < ROUNDS:
+                self._refine(self.rig)
+            problem = self._problem(self.here)
             x = self._begin(problem)
-            if self.rig is not None and self.round < ROUNDS:
-                self._refine(self.rig, problem, pixels, x)
-                continue
-            if self.weight is None and self.level in self.search_levels:
-                x = self._choose(problem, pixels, x)
-            weight = self.guess if self.weight is None else self.weight
-            at_last = self.level == len(self.levels) - 1
-            coarse = EARLY_TOLERANCE if self.settings.weight == 0.0 else COARSE_TOLERANCE
-            tolerance = self.settings.tolerance * (1 if at_last else coarse)
-            _, converged = self._solve(problem, pixels, x, COARSE_WEIGHT if weight is None else weight, tolerance)
-            if at_last:
-                return converged
-            self.level, self.round, self.iteration = self.level + 1, 0, 0
+            if self.weight is None and level in self.search_levels:
+                x = self._choose(problem, x)
+            _, converged = self._solve(problem, x, self._weight_or(COARSE_WEIGHT), 1 if level == last else coarse)
+        return converged
 
     @property
     def here(self) -> Level:
         return self.levels[self.level]
 
-    def _choose(self, problem: Problem, pixels: Problem | None, x: Tensor) -> Tensor:
+    def _weight_or(self, other: float) -> float:
+        """The weight, while it is open that of a coarser grid, and before that another."""
+        return next((weight for weight in (self.weight, self.guess) if weight is not None), other)
+
+    def _choose(self, problem: Problem, x: Tensor) -> Tensor:
         """Choose the weight from the data; return the field to continue from."""
 
         def solve(weight: float, x: Tensor) -> Iterate:
             self.iteration = 0
-            iterate, _ = self._solve(problem, pixels, x, weight, COARSE_TOLERANCE * self.settings.tolerance)
-            return replace(iterate, residual=_residual(pixels, iterate))
+            iterate, _ = self._solve(problem, x, weight, COARSE_TOLERANCE)
+            return replace(iterate, residual=problem.pixel_residual(iterate))
 
-        noise = _noise(problem, pixels)
-        choice = choose_weight(solve, x, noise, self.guess)
+        choice = choose_weight(solve, x, problem.noise, self.guess)
         self.guess, self.reason, self.iteration = choice.weight, choice.reason, 0
-        if noise is None or self.level == self.search_levels[-1]:
+        if problem.noise is None or self.level == self.search_levels[-1]:
             self.weight = choice.weight
         return choice.x
 
-    def _refine(self, rig: Refinement, problem: Problem, pixels: Problem | None, x: Tensor) -> None:
+    def _refine(self, rig: Refinement) -> None:
         """Iterate the field for the present rig, then refine the rig by a step."""
-        weight = next((w for w in (self.weight, self.guess) if w is not None), REFINEMENT_WEIGHT)
-        tolerance = COARSE_TOLERANCE * self.settings.tolerance
+        problem = self._problem(self.here)
         if not self.iteration:
             self.iteration = max(0, self.settings.iterations - ROUND_ITERATIONS * (1 + 2 * (self.round == 0)))
-        iterate, _ = self._solve(problem, pixels, x, weight, tolerance)
+        iterate, _ = self._solve(problem, self._begin(problem), self._weight_or(REFINEMENT_WEIGHT), COARSE_TOLERANCE)
         momentum = MOMENTUM if self.round < ROUNDS - ROUNDS_WITHOUT_MOMENTUM else 0.0
         parts = random_pixels(self.finest_target, len(self.measurement.names), self.round)
         sigma_known = self.finest_target.sigma_known
@@ -208,25 +208,25 @@ class Descent:
         """A random sample of pixels, for the residual on levels with bins."""
         return replace(self._target(1, pixel_subset(self.measurement, PIXELS)), scale=self.scale)
 
-    def _problems(self, level: Level) -> tuple[Problem, Problem | None]:
-        """The problem of a level and, where it has bins, that of single pixels."""
+    def _problem(self, level: Level) -> Problem:
+        """The problem of a level, with that of single pixels where it has bins."""
         same = level.edge == self.levels[-1].edge
         target = self.finest_target if same else replace(self._target(level.edge), scale=self.scale)
-        return self._problem(level, target), None if level.edge == 1 else self._problem(level, self.pixel_target)
+        pixels = None if level.edge == 1 else self._problem_on(level.grid, self.pixel_target)
+        return self._problem_on(level.grid, target, pixels)
 
-    def _problem(self, level: Level, target: Target) -> Problem:
+    def _problem_on(self, grid: Grid, target: Target, pixels: Problem | None = None) -> Problem:
         if self.rig is not None:
             target = replace(target, parts=tuple(self.rig.of(part) for part in target.parts))
-        operators = [self.layout.operator(part.rays, level.grid, part.model) for part in target.parts]
-        return Problem(operators, target, None if self.free is None else coarser(self.free, level.grid), self.bounds)
+        operators = [self.layout.operator(part.rays, grid, part.model) for part in target.parts]
+        return Problem(operators, target, None if self.free is None else coarser(self.free, grid), self.bounds, pixels)
 
     # -- iterations ------------------------------------------------------------------------------------------------
 
-    def _solve(
-        self, problem: Problem, pixels: Problem | None, x: Tensor, weight: float, tolerance: float
-    ) -> tuple[Iterate, bool]:
-        """Iterate until convergence or the last iteration; return the last iterate, and whether it has converged."""
-        settings, past, noise = self.settings, [math.inf] * self.settings.patience, _noise(problem, pixels)
+    def _solve(self, problem: Problem, x: Tensor, weight: float, factor: float) -> tuple[Iterate, bool]:
+        """Iterate to a factor times the tolerance, or as often as given; return the iterate, and whether converged."""
+        settings, past = self.settings, [math.inf] * self.settings.patience
+        tolerance, noise = factor * settings.tolerance, problem.noise if settings.weight == 0.0 else None
         if settings.weight is not None:
             self.reason = ""
         self.x = x
@@ -238,15 +238,15 @@ class Descent:
             pause()
             self.x, self.iteration, self.iterations = iterate.x, self.iteration + 1, self.iterations + 1
             before, past = past[0], [*past[1:], objective]
-            self._report(problem, pixels, iterate, weight)
+            self._report(problem, iterate, weight)
             converged = 0 <= before - objective < tolerance * settings.patience * objective
-            if settings.weight == 0.0 and noise is not None and _residual(pixels, iterate) <= noise:
+            if noise is not None and problem.pixel_residual(iterate) <= noise:
                 self.reason, converged = DISCREPANCY, True
             if converged or self.iteration >= settings.iterations:
                 return iterate, converged
         raise AssertionError("a method iterates without end")
 
-    def _report(self, problem: Problem, pixels: Problem | None, iterate: Iterate, weight: float) -> None:
+    def _report(self, problem: Problem, iterate: Iterate, weight: float) -> None:
         """Record the iteration and call on_step; stop the run if that requests it, or at the time limit."""
         voxels = float(max(self.here.grid.shape))
         record = {
@@ -254,8 +254,8 @@ class Descent:
             "bin_edge": float(self.here.edge), "weight": weight, "residual": math.sqrt(iterate.residual),
             "penalty": iterate.penalty, "objective": iterate.objective(weight),
         }  # fmt: skip
-        if pixels is None and problem.target.noise is not None:
-            record["residual_over_sigma"] = math.sqrt(iterate.residual / problem.target.noise)
+        if problem.pixels is None and problem.noise is not None:
+            record["residual_over_sigma"] = math.sqrt(iterate.residual / problem.noise)
         self.history.append(record)
         losses = {k: v for k, v in record.items() if k in ("voxels", "weight", "residual", "residual_over_sigma")}
         speed = len(problem.target) * self.iterations / max(self.seconds, 1e-9)
@@ -344,13 +344,3 @@ class Descent:
             rig=[] if self.rig is None else self.rig.table(),
             axis=self.axis,
         )
-
-
-def _residual(pixels: Problem | None, iterate: Iterate) -> float:
-    """|F x - b|^2 of single pixels."""
-    return iterate.residual if pixels is None else pixels.residual(iterate.x)
-
-
-def _noise(problem: Problem, pixels: Problem | None) -> float | None:
-    """The residual of the noise alone; None where sigma is not known."""
-    return (pixels or problem).target.noise

@@ -84,14 +84,15 @@ class Differences:
 class Problem:
     """The data and the operators on one grid, one for each part of the target.
 
-    `free` voxels are not ambient, None for all; `bounds` are the lowest and highest value of the field, or None.
+    `free` voxels are not ambient, None for all; `bounds` are the lowest and highest value of the field, or None;
+    `pixels` is the problem of single pixels for a target of bins.
     """
 
     def __init__(
         self, operators: Sequence[VoxelOperator], target: Target, free: Bool[Tensor, "z y x"] | None = None,
-        bounds: tuple[float, float] | None = None,
+        bounds: tuple[float, float] | None = None, pixels: Problem | None = None,
     ) -> None:  # fmt: skip
-        self.operators, self.target, self.scale = tuple(operators), target, target.scale
+        self.operators, self.target, self.scale, self.pixels = tuple(operators), target, target.scale, pixels
         self.operator = operator = self.operators[0]
         self.differences = Differences(operator.grid, operator.boundary)
         self.voxels = math.prod(operator.grid.shape)
@@ -118,11 +119,31 @@ class Problem:
         """Return |F x - b|^2."""
         return _square(self.data - self.forward(x))
 
+    def pixel_residual(self, iterate: Iterate) -> float:
+        """Return |F x - b|^2 of single pixels."""
+        return iterate.residual if self.pixels is None else self.pixels.residual(iterate.x)
+
+    @property
+    def noise(self) -> float | None:
+        """|F x - b|^2 of single pixels due to noise alone; None where sigma is not known."""
+        return (self.pixels or self).target.noise
+
     def predict(self, part: Part, rays: Rays, x: Float[Tensor, "z y x"]) -> Float[Tensor, "n c"]:
         """Return the projections of x along other rays of the technique of a part."""
         parts = zip(self.operators, self.target.parts, strict=True)
         operator = next(operator for operator, p in parts if p.model.name == part.model.name)
         return operator.for_rays(rays, part.model)(x * self.scale)
+
+    def matrix(
+        self, apply: Callable[[Tensor], Tensor], on_voxel: Callable[[int, int], None] = lambda done, total: None
+    ) -> Float[Tensor, "n m"]:
+        """Return a linear operator on fields as a matrix, column by column, for small grids."""
+        ones = torch.eye(self.voxels).to(self.zero()).reshape(-1, *self.operator.domain_shape)
+        columns = torch.empty(apply(ones[0]).numel(), self.voxels, dtype=torch.float64)
+        for i, one in enumerate(ones):
+            columns[:, i] = apply(one).flatten()
+            on_voxel(i + 1, self.voxels)
+        return columns
 
     def pin(self, x: Float[Tensor, "z y x"]) -> Float[Tensor, "z y x"]:
         """Return x with 0, the ambient index, in voxels that are not free."""
@@ -193,6 +214,10 @@ class Penalty:
             return self.problem.differences.adjoint(self.problem.differences(y[0] * self.root))
         along = tuple(a * factor for a, factor in zip(y, self.factors, strict=True))
         return self.problem.differences.adjoint((along[0], along[1], along[2]))
+
+    def squares(self) -> Float[Tensor, "m m"]:
+        """Return L^T L as a matrix, for small grids."""
+        return self.problem.matrix(lambda x: self.adjoint(self(x)))
 
 
 def minimise(problem: Problem, penalty: Penalty, weight: float, x: Tensor) -> Iterator[Iterate]:
