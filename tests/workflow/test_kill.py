@@ -17,7 +17,7 @@ from nerif.fields.network import NetworkShape
 from nerif.geometry import Grid
 from nerif.reconstruction.base import Reconstructor
 from nerif.reconstruction.neural.neural import NeRIF
-from nerif.reconstruction.voxels.tikhonov import Tikhonov
+from nerif.reconstruction.voxels.total_variation import TotalVariation
 from nerif.results.directory import ResultDirectory
 from nerif.workflow.job import Run
 from nerif.workflow.pipeline import reconstruct_into
@@ -29,7 +29,7 @@ RUN = Run(uncertainty="fast", checkpoint_every=0.0)
 NETWORK = NetworkShape(depth=2, width=32, octaves=3)
 METHODS: dict[str, Reconstructor] = {
     "nerif": NeRIF(max_steps=60, points_per_batch=512, network=NETWORK, refine=("cameras",), device="cpu"),
-    "tikhonov": Tikhonov(voxels=16, iterations=20, regularisation=1e-3, device="cpu"),
+    "tv": TotalVariation(voxels=16, device="cpu"),
 }
 KILLS = 15  # of each method
 STAGES = [step.__name__ for step in (*STEPS, *CLOSING) if step.__name__ != "WriteAxis"]

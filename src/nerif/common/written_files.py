@@ -19,6 +19,7 @@ from nerif.common.files import write_json
 __all__ = ["WARN", "WRITTEN", "OwnFiles", "remove_empty"]
 
 WRITTEN = "written.json"
+PENDING = {"pending": True}
 WARN = logging.getLogger("nerif").warning
 
 
@@ -41,9 +42,14 @@ class OwnFiles:
 
     @contextmanager
     def writing(self, name: str) -> Iterator[Path]:
-        """Yield the path to write a file to and list the file afterwards; rename a foreign file of that name."""
+        """Yield the path to write a file to and list the file afterwards; rename a foreign file of that name.
+
+        Until then its entry is `pending`, so that a process killed while it writes leaves no file that counts as foreign.
+        """
         self.set_aside([name])
         path = self.directory / name
+        if self.directory.is_dir():
+            self._write_list({**self._entries(), name: PENDING})
         yield path
         self._write_list({**self._entries(), name: _identity(path)})
 
@@ -92,6 +98,8 @@ class OwnFiles:
         if entry is None or path.is_symlink() or not path.is_file():
             return False
         now = path.stat()
+        if entry == PENDING:
+            return True
         if now.st_size != entry.get("bytes"):
             return False
         # a copy of the directory has other times

@@ -5,6 +5,9 @@ have more of it than their sigma states.
 
 A rig is refined between solutions: on each level ROUNDS times, with a few iterations of the field after each.
 
+A checkpoint holds the run as it was at the start of the level, or of the round of refinement, that is under way: a run
+that is killed repeats this level, and gives the same field as one that was not.
+
 A method without a penalty is regularised by stopping early. On coarse grids its residual never reaches the noise, so it
 moves on as soon as progress is slow.
 """
@@ -109,6 +112,8 @@ class Descent:
         self.guess: float | None = None
         self.reason = ""
         self.x: Tensor | None = None
+        self.checkpoint: State
+        self.ended: Outcome | None = None  # of the run that is resumed
         self.earlier_seconds, self.begin_time = 0.0, time.perf_counter()
         self.fingerprint = fingerprint(measurement, settings.open_faces)
         if resume is not None:
@@ -128,6 +133,8 @@ class Descent:
     def __call__(self) -> Reconstruction:
         """Solve on one level after the other; return the last field at the end or when the run is stopped."""
         with self.cores:
+            if self.ended is not None:
+                return self._result(self.ended)
             try:
                 return self._result(self._outcome(self._descend()))
             except _Stop as stop:
@@ -143,7 +150,8 @@ class Descent:
             while self.rig is not None and self.round < ROUNDS:
                 self._refine(self.rig)
             problem = self._problem(self.here)
-            x = self._begin(problem)
+            self.x = x = self._begin(problem)
+            self.checkpoint = self._capture()
             if self.weight is None and level in self.search_levels:
                 x = self._choose(problem, x)
             _, converged = self._solve(problem, x, self._weight_or(COARSE_WEIGHT), 1 if level == last else coarse)
@@ -174,9 +182,11 @@ class Descent:
     def _refine(self, rig: Refinement) -> None:
         """Iterate the field for the present rig, then refine the rig by a step."""
         problem = self._problem(self.here)
+        self.x = x = self._begin(problem)
+        self.checkpoint = self._capture()
         if not self.iteration:
             self.iteration = max(0, self.settings.iterations - ROUND_ITERATIONS * (1 + 2 * (self.round == 0)))
-        iterate, _ = self._solve(problem, self._begin(problem), self._weight_or(REFINEMENT_WEIGHT), COARSE_TOLERANCE)
+        iterate, _ = self._solve(problem, x, self._weight_or(REFINEMENT_WEIGHT), COARSE_TOLERANCE)
         momentum = MOMENTUM if self.round < ROUNDS - ROUNDS_WITHOUT_MOMENTUM else 0.0
         parts = random_pixels(self.finest_target, len(self.measurement.names), self.round)
         sigma_known = self.finest_target.sigma_known
@@ -261,7 +271,7 @@ class Descent:
         speed = len(problem.target) * self.iterations / max(self.seconds, 1e-9)
         limit = self.settings.time_limit
         step = Step(
-            self.iterations, float(self.iterations), self.seconds, self._progress(), losses, speed, self._capture,
+            self.iterations, float(self.iterations), self.seconds, self._progress(), losses, speed, lambda: self.checkpoint,
             lambda: self._field(self.here),
         )  # fmt: skip
         if self.on_step is not None and self.on_step(step):
@@ -311,6 +321,11 @@ class Descent:
         self.history = list(scalars["history"])
         for name, attribute in STATE.items():
             setattr(self, attribute, scalars[name])
+        ended = Outcome(*scalars.get("outcome", ("", "")))
+        same = scalars.get("tolerance") == self.settings.tolerance and self.settings.weight in (None, self.weight)
+        complete = ended.reason == "iterations" and self.settings.iterations <= self.iteration
+        if same and (complete or ended.reason in ("converged", "discrepancy")):
+            self.ended = ended
         if self.settings.weight is not None:
             self.weight = self.settings.weight
         elif self.level > self.search_levels[-1] and self.weight is None:
@@ -329,6 +344,11 @@ class Descent:
 
     def _result(self, outcome: Outcome) -> Reconstruction:
         assert self.x is not None
+        state = self._capture()
+        state.scalars["outcome"], state.scalars["tolerance"] = (
+            [outcome.reason, outcome.message],
+            self.settings.tolerance,
+        )
         return Reconstruction(
             field=self._field(self.here).to("cpu"),
             box=self.measurement.box,
@@ -339,7 +359,7 @@ class Descent:
             seconds=self.seconds,
             peak_memory_bytes=peak_memory(self.device),
             device=str(self.device),
-            state=self._capture(),
+            state=state,
             quantity=self.measurement.quantity,
             rig=[] if self.rig is None else self.rig.table(),
             axis=self.axis,
