@@ -44,7 +44,7 @@ class OwnFiles:
     def writing(self, name: str) -> Iterator[Path]:
         """Yield the path to write a file to and list the file afterwards; rename a foreign file of that name.
 
-        Until then its entry is `pending`, so that a process killed while it writes leaves no file that counts as foreign.
+        Its entry is `pending` until then: a file of a process that was killed while it wrote is not foreign.
         """
         self.set_aside([name])
         path = self.directory / name

@@ -271,8 +271,8 @@ class Descent:
         speed = len(problem.target) * self.iterations / max(self.seconds, 1e-9)
         limit = self.settings.time_limit
         step = Step(
-            self.iterations, float(self.iterations), self.seconds, self._progress(), losses, speed, lambda: self.checkpoint,
-            lambda: self._field(self.here),
+            self.iterations, float(self.iterations), self.seconds, self._progress(), losses, speed,
+            lambda: self.checkpoint, lambda: self._field(self.here),
         )  # fmt: skip
         if self.on_step is not None and self.on_step(step):
             raise _Stop("interrupted", f"stopped on request at {voxels:.0f} voxels; continue with --resume")
@@ -345,10 +345,8 @@ class Descent:
     def _result(self, outcome: Outcome) -> Reconstruction:
         assert self.x is not None
         state = self._capture()
-        state.scalars["outcome"], state.scalars["tolerance"] = (
-            [outcome.reason, outcome.message],
-            self.settings.tolerance,
-        )
+        state.scalars["outcome"] = [outcome.reason, outcome.message]
+        state.scalars["tolerance"] = self.settings.tolerance
         return Reconstruction(
             field=self._field(self.here).to("cpu"),
             box=self.measurement.box,
