@@ -9,7 +9,7 @@ from typing import Any
 
 from nicegui import ui
 
-from nerif.app.pieces import refusals
+from nerif.app.elements import refusals, select
 from nerif.imaging.readers.crop import Crop
 
 __all__ = ["CropEditor"]
@@ -74,8 +74,7 @@ class CropEditor:
         return control.on_value_change(update)
 
     def _choice(self, label: str, options: dict[Any, str], key: str) -> ui.select:
-        control = ui.select(options, label=label, value=getattr(self.crop, key)).props("outlined dense options-dense")
-        control.props["aria-label"] = label
+        control = select(label, options, getattr(self.crop, key))
 
         async def update() -> None:
             if control.value != getattr(self.crop, key):

@@ -7,10 +7,10 @@ from typing import Any
 
 from nicegui import ui
 
+from nerif.app.elements import CommandLine, refusals
 from nerif.app.form_view import FormView
 from nerif.app.forms import Form
 from nerif.app.job_status import LINES, JobStatus
-from nerif.app.pieces import CommandLine, refusals
 from nerif.app.workspace import Workspace
 
 __all__ = ["JobForm"]

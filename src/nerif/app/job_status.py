@@ -6,8 +6,8 @@ from collections.abc import Awaitable, Callable, Sequence
 
 from nicegui import ui
 
+from nerif.app.elements import text_html
 from nerif.app.jobs import REFUSED, Job
-from nerif.app.pieces import text_html
 from nerif.app.workspace import Workspace
 from nerif.common.conventions import InputError
 

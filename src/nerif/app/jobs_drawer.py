@@ -8,8 +8,8 @@ from pathlib import Path
 
 from nicegui import ui
 
+from nerif.app.elements import dialog, refusals, text_html
 from nerif.app.jobs import REFUSED, Job
-from nerif.app.pieces import refusals
 from nerif.app.workspace import Workspace
 from nerif.common.conventions import InputError
 from nerif.data.volume_sequence import VolumeSequence
@@ -97,7 +97,7 @@ class JobsDrawer:
             for job in jobs[:MOST]:
                 self._row(job, *progress[job.id])
             if not jobs:
-                ui.html("<p class=note>No runs yet.</p>", sanitize=False)
+                text_html("No runs yet.", classes="note")
 
     def _look(self) -> tuple[list[Job], dict[str, tuple[float, str]]]:
         jobs = self.work.jobs.all()
@@ -111,7 +111,7 @@ class JobsDrawer:
                 f"<code>{escape(job.line)}</code>", sanitize=False,
             )  # fmt: skip
             if job.state == "refused":
-                ui.html(f"<p class=note>{escape(REFUSED)}</p>", sanitize=False)
+                text_html(REFUSED, classes="note")
             if job.state == "running" and share:
                 ui.linear_progress(share, show_value=False).props(f'aria-label="{escape(job.title)}"')
             with ui.row().classes("gap-1"):
@@ -128,10 +128,10 @@ class JobsDrawer:
         await self._refresh()
 
     def _log(self, id: str) -> None:
-        with refusals(), ui.dialog(value=True) as dialog, ui.card().classes("log"):
+        with refusals(), dialog("log"):
             job = self.work.jobs.get(id)
             text = "\n".join(self.work.jobs.log(id)) or "The log is empty."
             began = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(job.started)) if job.started else "not started"
-            ui.html(f"<h2>{escape(job.title)}</h2><p class=note>{began}</p>", sanitize=False)
+            text_html(job.title, "h2")
+            text_html(began, classes="note")
             ui.html(f"<pre tabindex=0>{escape(text)}</pre>", sanitize=False)
-            ui.button("Close", on_click=dialog.close).props("flat no-caps")

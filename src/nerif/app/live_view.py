@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from nicegui import ui
 
+from nerif.app.elements import refusals, select
 from nerif.app.jobs import Job
 from nerif.app.jobs_drawer import film_progress
 from nerif.app.live_surface import LiveSurface, caption_of
-from nerif.app.pieces import refusals
 from nerif.app.workspace import Workspace
 from nerif.common.conventions import unit_shown
 from nerif.data.volume import name_of
@@ -42,9 +42,7 @@ class LiveView:
         self._cache: dict[str, Any] = {}
         with ui.element("section").classes("card").props('aria-label="The run"'):
             ui.html("<h2>The run</h2>", sanitize=False)
-            self.choice = ui.select({}, label="Run", on_change=lambda e: self.follow(e.value)).props(
-                'outlined dense options-dense aria-label="Run"'
-            )
+            self.choice = select("Run", {}).on_value_change(lambda event: self.follow(event.value))
             self.status = ui.html("", sanitize=False).classes("status").props('aria-live="off"')
             self.bar = ui.linear_progress(0.0, show_value=False).props('aria-label="Progress"')
             with ui.row().classes("gap-2"):

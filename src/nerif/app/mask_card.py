@@ -9,11 +9,11 @@ from pathlib import Path
 
 from nicegui import ui
 
+from nerif.app.elements import dialog, refusals, select, text_html
 from nerif.app.forms import Form
 from nerif.app.job_form import JobForm
 from nerif.app.mask_editor import MaskEditor
 from nerif.app.mask_edits import MaskEdits
-from nerif.app.pieces import refusals, text_html
 from nerif.app.project import OWN
 from nerif.app.view_maps import magnitude_address, threshold_address
 from nerif.app.workspace import Workspace
@@ -43,8 +43,8 @@ class MaskCard:
     ) -> None:
         self.work, self.page, self.name, self.measurement = work, page, name, measurement
         self.edits = MaskEdits(measurement.names, work.draft(page).get("masks", {}).get(name))
-        self.view = ui.select(list(measurement.names), label="View", value=measurement.names[0])
-        self.view.props('outlined dense options-dense aria-label="View to draw in"').classes("short")
+        self.view = select("View", list(measurement.names), measurement.names[0]).classes("short")
+        self.view.props["aria-label"] = "View to draw in"
         with ui.element("div").classes("numbers"):
             for label, icon, step in (("Undo", "undo", self.edits.undo), ("Redo", "redo", self.edits.redo)):
                 button = ui.button(label, icon=icon, on_click=lambda step=step: self._step(step()))
@@ -132,9 +132,7 @@ class MaskCard:
             record = self.job.view.record()
             settings: MaskSettings = record.masks
             address = await self.work.beside(threshold_address, self.measurement, index, settings, record.sigma)
-            with ui.dialog() as dialog, ui.card():
+            with dialog():
                 text_html(f"Threshold mask of view {self.view.value}; white: flow", "h3")
                 image = ui.element("img").style("width: min(70vw, 600px); image-rendering: pixelated")
                 image.props["src"], image.props["alt"] = address, "Threshold mask"
-                ui.button("Close", on_click=dialog.close).props("flat no-caps")
-            dialog.open()

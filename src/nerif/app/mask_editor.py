@@ -7,8 +7,8 @@ from typing import Any
 
 from nicegui import ui
 
+from nerif.app.elements import refusals
 from nerif.app.mask_edits import MaskEdits
-from nerif.app.pieces import refusals
 from nerif.imaging.masks import MaskShape
 
 __all__ = ["MaskEditor"]

@@ -12,7 +12,7 @@ from typing import Any
 from nicegui import ui
 
 from nerif.analysis.resampling import common_grid, difference, resampled
-from nerif.app.pieces import text_html
+from nerif.app.elements import select, text_html
 from nerif.app.range_slider import RangeSlider
 from nerif.app.slices_view import Panel, SlicesView
 from nerif.app.sources import Source, source_of
@@ -66,10 +66,10 @@ class ResultLook:
         quantity = str(self.draft.get("quantity", ""))
         options = {q: describe(q)[1].capitalize() for q in quantities}
         with ui.element("div").classes("choices"):
-            self.quantity = _select("Quantity", options, quantity if quantity in options else quantities[0])
+            self.quantity = select("Quantity", options, quantity if quantity in options else quantities[0])
             against = str(self.draft.get("against", ""))
             choices = {"": "Nothing", **{name: name for name in self.others}}
-            self.against = _select("Compare with", choices, against if against in choices else "")
+            self.against = select("Compare with", choices, against if against in choices else "")
             self.spread = ui.switch("Standard deviation", value=bool(self.draft.get("spread")))
         for control in (self.quantity, self.against, self.spread):
             control.on_value_change(self._update_draft)
@@ -225,9 +225,3 @@ def _interval(times: Sequence[float]) -> float:
 def _unit(volume: Volume) -> str:
     """The unit for display, empty for a pure number."""
     return unit_shown(LABELS.get(volume.quantity.removesuffix("_std"), ("", volume.unit))[1])
-
-
-def _select(label: str, options: Any, value: str) -> ui.select:
-    select = ui.select(options, label=label, value=value).props("outlined dense options-dense")
-    select.props["aria-label"] = label
-    return select

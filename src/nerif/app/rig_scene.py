@@ -5,12 +5,12 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from html import escape
 from pathlib import Path
 
 import numpy as np
 from nicegui import ui
 
+from nerif.app.elements import table_html, text_html
 from nerif.common.conventions import InputError
 from nerif.geometry import Box, Camera
 from nerif.imaging.calibration.importers.importers import import_box, import_cameras
@@ -57,7 +57,7 @@ def read_rig(path: Path) -> Rig:
 def show_rig(rig: Rig) -> None:
     """Build the scene and the table."""
     for text in rig.missing:
-        ui.html(f"<p class=note>{escape(text)}</p>", sanitize=False)
+        text_html(text, classes="note")
     if not rig.cameras:
         return
     camera = ui.scene.perspective_camera(fov=38)
@@ -107,18 +107,12 @@ def show_rig(rig: Rig) -> None:
 
 
 def _table(cameras: Sequence[Camera], errors: Sequence[ImageError]) -> str:
-    rows = []
+    rows: dict[str, tuple[str, ...]] = {}
     for camera in cameras:
         camera_errors = [e for e in errors if e.camera == camera.name]
         height, width = camera.image_size
         used = f"{sum(e.used for e in camera_errors)} of {len(camera_errors)}" if camera_errors else "unknown"
         rms = f"{rms_of(camera_errors):.3f}" if any(e.used for e in camera_errors) else "unknown"
         place = ", ".join(f"{round(float(x), 1) + 0.0:.1f}" for x in camera.centre)
-        cells = (f"{width} × {height}", f"{float(camera.intrinsics[0, 0]):.1f}", place, used, rms)
-        line = "".join(f"<td>{escape(cell)}</td>" for cell in cells)
-        rows.append(f"<tr><th scope=row>{escape(camera.name)}</th>{line}</tr>")
-    head = "".join(f"<th scope=col>{escape(title)}</th>" for title in HEAD)
-    return (
-        f"<div class=tabled tabindex=0 role=region aria-label=Cameras><table><thead><tr>{head}</tr></thead>"
-        f"<tbody>{''.join(rows)}</tbody></table></div>"
-    )
+        rows[camera.name] = (f"{width} × {height}", f"{float(camera.intrinsics[0, 0]):.1f}", place, used, rms)
+    return table_html("Cameras", HEAD, rows)

@@ -7,7 +7,7 @@ from html import escape
 
 from nicegui import ui
 
-from nerif.app.pieces import text_html
+from nerif.app.elements import text_html
 from nerif.app.workspace import Workspace
 from nerif.common.conventions import InputError
 from nerif.imaging.calibration.result import ImageError

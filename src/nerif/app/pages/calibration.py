@@ -8,12 +8,12 @@ from typing import Any
 import tyro
 from nicegui import ui
 
+from nerif.app.elements import CommandLine, card, refusals, select, text_html
 from nerif.app.form_view import FormView
 from nerif.app.forms import Form
 from nerif.app.job_status import JobStatus
 from nerif.app.jobs import Job
 from nerif.app.pages.page import Page
-from nerif.app.pieces import CommandLine, card, refusals, text_html
 from nerif.app.project import Contents
 from nerif.app.rig_scene import read_rig, show_rig
 from nerif.app.target_images import TargetImages
@@ -70,8 +70,8 @@ class CalibrationPage:
                 if not experiments:
                     text_html("There are no images in this folder yet; the page Images says where they go.")
                 first = available if available in experiments else next(iter(experiments), None)
-                self.experiment = self._select("Experiment", experiments, first)
-                self.way = self._select("From", WAYS, bool(memory.get("simple", False)))
+                self.experiment = select("Experiment", experiments, first).classes("short")
+                self.way = select("From", WAYS, bool(memory.get("simple", False))).classes("short")
                 self.out = ui.input("Calibration to write", value=str(memory.get("out", "calibration.toml")))
                 self.out.props("outlined dense debounce=250").props["aria-label"] = "Calibration to write"
                 self.out.on_value_change(self._show)
@@ -84,17 +84,12 @@ class CalibrationPage:
                     self.command = CommandLine()
                     self.notice = JobStatus(work, f"{PAGE.name}.run", self._ended)
                 with card("The rig"):
-                    self.calibration = self._select("Calibration", list(outcome.calibrations), None)
+                    self.calibration = select("Calibration", list(outcome.calibrations)).classes("short")
                     self.rig = ui.element("div").classes("rig")
                 with card("Images of the target", "Circles: detected points, the first one filled. "
                           "Left-out images are part of the command line; calibrate again after it."):  # fmt: skip
-                    self.view = self._select("View", [], None)
+                    self.view = select("View", []).classes("short")
                     self.images = TargetImages(work, self._toggled)
-
-    def _select(self, label: str, options: Any, value: Any) -> ui.select:
-        select = ui.select(options, label=label, value=value).props("outlined dense options-dense").classes("short")
-        select.props["aria-label"] = label
-        return select
 
     # -- the form ------------------------------------------------------------------------------------------------
 

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from html import escape
 
 from nicegui import ui
 
 from nerif.analysis.consistency import Consistency, check_consistency
-from nerif.app.file_choice import FileChoice
+from nerif.app.elements import CommandLine, FileChoice, card, items_html, refusals, table_html, text_html
 from nerif.app.form_view import FormView
 from nerif.app.forms import Form
 from nerif.app.job_form import JobForm
 from nerif.app.job_status import JobStatus
 from nerif.app.pages.page import Page
-from nerif.app.pieces import CommandLine, card, refusals, text_html
 from nerif.app.workspace import Workspace
 from nerif.cli.commands.check import Check
 from nerif.data.measurement import Measurement
@@ -137,14 +135,12 @@ class CheckPage:
     def _show(self, name: str, compared: Sequence[str], result: Consistency) -> None:
         """The verdicts, and the correction that is offered."""
         ui.html(views_table(result), sanitize=False)
-        notes = "".join(f"<li>{escape(text)}</li>" for text in result.remarks)
-        findings = "".join(f"<li>{escape(str(finding))}</li>" for finding in result.findings)
-        if findings:
-            ui.html(f"<h3>Found</h3><ul class=notes>{findings}</ul>", sanitize=False)
+        if result.findings:
+            ui.html(f"<h3>Found</h3>{items_html([str(finding) for finding in result.findings])}", sanitize=False)
         elif result.views:
             text_html("No problems found.", classes="status")
-        if notes:
-            ui.html(f"<h3>Notes</h3><ul>{notes}</ul>", sanitize=False)
+        if result.remarks:
+            ui.html(f"<h3>Notes</h3>{items_html(result.remarks, '')}", sanitize=False)
         if result.corrections:
             out = self.work.project.free_name(f"{name.removesuffix('.nc')}.corrected.nc")
             arguments = [*compared, "--out", out]
@@ -169,14 +165,11 @@ def views_table(result: Consistency) -> str:
     """Return the agreement of every view as HTML; nothing where there are too few views."""
     if not result.views:
         return ""
-    rows = "".join(
-        f"<tr><th scope=row>{escape(v.name)}</th><td>{escape(v.measured)}</td><td>{v.valid:.1%}</td>"
-        f"<td>{v.agreement:.2f}</td><td>{v.gain:.2f}</td><td>{escape(v.verdict or 'fits')}</td></tr>"
+    rows = {
+        v.name: (v.measured, f"{v.valid:.1%}", f"{v.agreement:.2f}", f"{v.gain:.2f}", v.verdict or "fits")
         for v in result.views
-    )
-    heads = "".join(f"<th scope=col>{h}</th>" for h in ("View", "Measured", "Valid", "Agreement", "Gain", "Verdict"))
-    table = f"<table><thead><tr>{heads}</tr></thead><tbody>{rows}</tbody></table>"
-    return f'<div class=tabled tabindex=0 role=region aria-label="Agreement of the views">{table}</div>'
+    }
+    return table_html("Agreement of the views", ("View", "Measured", "Valid", "Agreement", "Gain", "Verdict"), rows)
 
 
 async def build(work: Workspace) -> None:

@@ -7,10 +7,10 @@ from html import escape
 
 from nicegui import ui
 
+from nerif.app.elements import CommandLine, card, figures, items_html
 from nerif.app.form_view import FormView
 from nerif.app.forms import Form
 from nerif.app.pages.page import Page
-from nerif.app.pieces import CommandLine, card, figures
 from nerif.app.rig_drawing import rig_drawing
 from nerif.app.workspace import Workspace
 from nerif.cli.commands.design import Design
@@ -92,8 +92,8 @@ def _text(e: Expectation, request: Design) -> str:
         ("Window of the optical flow", f"{e.window:.2f} mm", f"{flow.window:g} px"),
         ("Diffraction", f"{e.diffraction:.2f} mm", ""),
     )
-    notes = "".join(f"<li>{escape(note[:1].upper() + note[1:])}.</li>" for note in e.notes)
-    return f"<div class=headline>{head}</div>{figures(rows)}" + (f"<ul class=notes>{notes}</ul>" if notes else "")
+    notes = items_html([f"{note[:1].upper()}{note[1:]}." for note in e.notes])
+    return f"<div class=headline>{head}</div>{figures(rows)}{notes}"
 
 
 PAGE = Page("design", "Design", "/design", "What a rig will see, before anyone drills a hole.", build)

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from nicegui import ui
 
-from nerif.app.file_choice import FileChoice
+from nerif.app.elements import FileChoice, card, refusals, select, text_html
 from nerif.app.forms import Form
 from nerif.app.job_form import JobForm
 from nerif.app.mask_card import MaskCard
 from nerif.app.pages.page import Page
-from nerif.app.pieces import card, refusals, text_html
 from nerif.app.project import Contents
 from nerif.app.view_maps import maps_html
 from nerif.app.workspace import Workspace
@@ -37,13 +37,13 @@ class DisplacementPage:
     """
 
     def __init__(self, work: Workspace, contents: Contents) -> None:
-        self.work, memory = work, work.draft(PAGE.name)
+        self.work, draft = work, work.draft(PAGE.name)
         self.measured: MeasurementCard | None = None
         if contents.experiments and contents.calibrations:
             with ui.element("div").classes("columns"):
                 with card("Images to displacements"), ui.element("div").classes("form"):
-                    self.experiment = self._select("Experiment", contents.experiments, memory.get("experiment"))
-                    self.calibration = self._select("Calibration", contents.calibrations, memory.get("calibration"))
+                    self.experiment = _select("Experiment", contents.experiments, draft)
+                    self.calibration = _select("Calibration", contents.calibrations, draft)
                     self.out = ui.input("Measurement to write", value=work.project.free_name("measurement.nc"))
                     self.out.props('outlined dense aria-label="Measurement to write"')
                     record = Displacement(Path("."), Path("."), Path("measurement.nc"))
@@ -55,8 +55,7 @@ class DisplacementPage:
                     for control in (self.experiment, self.calibration, self.out):
                         control.on_value_change(self._turned)
                 with card("Preview of one view", "With these settings, before all views are done."):
-                    self.view = ui.select([], label="View").props('outlined dense options-dense aria-label="View"')
-                    self.view.classes("short")
+                    self.view = select("View", []).classes("short")
                     self.button = ui.button("Preview", icon="visibility", on_click=self.preview)
                     self.button.props("outline no-caps")
                     self.display = ui.element("div").props('aria-live="polite"')
@@ -78,11 +77,6 @@ class DisplacementPage:
         if self.measured is not None:
             await self.measured.choice.choose(file)
         self.out.set_value(self.work.project.free_name("measurement.nc"))
-
-    def _select(self, label: str, names: Sequence[str], memory: object) -> ui.select:
-        control = ui.select(list(names), label=label, value=memory if memory in names else names[0])
-        control.props["aria-label"] = label
-        return control.props("outlined dense options-dense")
 
     def _words(self) -> list[str]:
         return [
@@ -129,6 +123,12 @@ class DisplacementPage:
             for text in lines:
                 text_html(text, classes="status")
             ui.html(html, sanitize=False)
+
+
+def _select(label: str, names: Sequence[str], draft: Mapping[str, Any]) -> ui.select:
+    """Build a choice of a file, by default the one in the draft."""
+    name = draft.get(label.lower())
+    return select(label, list(names), name if name in names else names[0])
 
 
 class MeasurementCard:

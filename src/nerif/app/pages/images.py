@@ -11,9 +11,9 @@ from nicegui import ui
 from nerif.app.blink import Blink
 from nerif.app.crop_editor import CropEditor
 from nerif.app.crop_edits import CropEdits
+from nerif.app.elements import CommandLine, card, items_html, refusals, select, text_html
 from nerif.app.histogram import histogram
 from nerif.app.pages.page import Page
-from nerif.app.pieces import CommandLine, card, refusals, text_html
 from nerif.app.workspace import Workspace
 from nerif.common.conventions import InputError
 from nerif.imaging.image_quality import ImageQuality
@@ -43,8 +43,7 @@ class ImagesPage:
         self.editor: CropEditor | None = None
         with ui.element("div").classes("stack"):
             with card("Folder of images"):
-                select = ui.select(list(experiments), label="Experiment", value=self.experiment)
-                select.props('outlined dense options-dense aria-label="Experiment"').classes("short")
+                choice = select("Experiment", list(experiments), self.experiment).classes("short")
                 self.summary = ui.element("div")
                 text_html("The next step on the command line", "h3")
                 self.command = CommandLine()
@@ -53,10 +52,10 @@ class ImagesPage:
             self.closer = ui.element("div")
 
         async def turned() -> None:
-            self.experiment, self.selection = select.value, ""
+            self.experiment, self.selection = choice.value, ""
             await self.build()
 
-        select.on_value_change(turned)
+        choice.on_value_change(turned)
 
     async def build(self) -> None:
         """Build everything for the experiment that is chosen; images come one after the other."""
@@ -90,12 +89,10 @@ class ImagesPage:
         self.work.keep(PAGE.name, {"experiment": self.experiment, "view": self.selection, "edits": self.memory})
 
     def _sum_up(self, wrong: Sequence[str]) -> None:
-        lines = "".join(f"<li>{escape(text)}</li>" for text in wrong)
-        listed = f"<ul class=notes aria-label='What is wrong'>{lines}</ul>" if lines else ""
-        messages = f"<p class=status>{len(self.views)} views. {'' if wrong else 'No problems found.'}</p>"
         self.summary.clear()
         with self.summary:
-            ui.html(messages + listed, sanitize=False)
+            text_html(f"{len(self.views)} views. {'' if wrong else 'No problems found.'}", classes="status")
+            ui.html(items_html(wrong, label="What is wrong"), sanitize=False)
 
     # -- a view in the grid --------------------------------------------------------------------------------------
 
@@ -125,9 +122,7 @@ class ImagesPage:
             with ui.element("div").classes("pair"):
                 for source in SOURCES:
                     _figure(view, source, looks.get(source), images.get(source, ""))
-            if wrong:
-                lines = "".join(f"<li>{escape(text)}</li>" for text in wrong)
-                ui.html(f"<ul class=notes>{lines}</ul>", sanitize=False)
+            ui.html(items_html(wrong), sanitize=False)
 
             async def choose() -> None:
                 self.selection = view.name

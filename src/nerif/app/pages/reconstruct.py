@@ -10,12 +10,11 @@ from typing import Any
 import tyro
 from nicegui import ui
 
-from nerif.app.file_choice import FileChoice
+from nerif.app.elements import CommandLine, FileChoice, card, refusals, select, text_html
 from nerif.app.form_view import FormView
 from nerif.app.forms import Form
 from nerif.app.live_view import LiveView
 from nerif.app.pages.page import Page
-from nerif.app.pieces import CommandLine, card, refusals, text_html
 from nerif.app.workspace import Workspace
 from nerif.cli.commands.reconstruct import COMMANDS, Reconstruct
 from nerif.cli.commands.sequence import Sequence
@@ -80,9 +79,7 @@ class ReconstructPage:
         self._build_form()
 
     def _select(self, label: str, options: Any, value: Any) -> ui.select:
-        select = ui.select(options, label=label, value=value)
-        select.props(f'outlined dense options-dense aria-label="{label}"')
-        return select.on_value_change(self._chosen)
+        return select(label, options, value).on_value_change(self._chosen)
 
     def _chosen(self) -> None:
         if hasattr(self, "live"):

@@ -9,12 +9,12 @@ from typing import Any
 import tyro
 from nicegui import ui
 
+from nerif.app.elements import CommandLine, card, figures, refusals, select, text_html
 from nerif.app.forms import Form
 from nerif.app.job_form import JobForm
 from nerif.app.job_status import JobStatus
 from nerif.app.jobs import Job
 from nerif.app.pages.page import Page
-from nerif.app.pieces import CommandLine, card, figures, refusals, text_html
 from nerif.app.result_answers import report_address, report_file
 from nerif.app.result_look import ResultLook
 from nerif.app.result_table import Row, result_table, rows_of
@@ -162,8 +162,7 @@ class ResultsPage:
     def _named(self, label: str, options: dict[str, str]) -> tuple[ui.select, ui.input]:
         """A choice of formats and the name of the file, which follows it."""
         first = next(iter(options))
-        choice = ui.select(options, label=label, value=first).props("outlined dense options-dense")
-        choice.props["aria-label"] = label
+        choice = select(label, options, first)
         name = ui.input("File to write", value=self._free(first)).props("outlined dense debounce=250")
         name.props["aria-label"] = "File to write"
         choice.on_value_change(lambda: name.set_value(self._free(choice.value)))
