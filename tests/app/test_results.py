@@ -17,7 +17,7 @@ from nerif.app.jobs import Jobs
 from nerif.app.project import Project
 from nerif.app.result_look import ResultLook
 from nerif.app.result_table import rows_of
-from nerif.app.sources import Film, Still
+from nerif.app.result_volumes import Film, Still
 from nerif.data.exports import export
 from nerif.data.volume import Volume
 from nerif.data.volume_file import read_volumes

@@ -9,7 +9,7 @@ from typing import Any, Generic, TypeVar
 from nicegui import ui
 
 from nerif.app.forms import Form, FormField
-from nerif.app.scale import Scale
+from nerif.app.sliders import Scale
 
 __all__ = ["FormView"]
 

@@ -12,8 +12,8 @@ from nicegui import ui
 
 from nerif.app.elements import refusals, select
 from nerif.app.jobs import Job
-from nerif.app.jobs_drawer import film_progress
-from nerif.app.live_surface import LiveSurface, caption_of
+from nerif.app.result_volumes import film_progress
+from nerif.app.surfaces import LiveSurface, caption_of
 from nerif.app.workspace import Workspace
 from nerif.common.conventions import unit_shown
 from nerif.data.volume import name_of
@@ -69,7 +69,7 @@ class LiveView:
         await self._refresh()
 
     async def _refresh(self) -> None:
-        jobs = [job for job in await self.work.beside(self.work.jobs.all) if job.resumable]
+        jobs = [job for job in await self.work.in_thread(self.work.jobs.all) if job.resumable]
         options = {job.id: f"{job.title} ({job.state})" for job in jobs}
         if not self.job and jobs:
             self.follow(jobs[0].id)
@@ -86,13 +86,13 @@ class LiveView:
     async def _show(self, job: Job) -> None:
         out = self.work.project.path(job.out)
         if out.suffix == ".zarr":
-            share, title = await self.work.beside(film_progress, out)
+            share, title = await self.work.in_thread(film_progress, out)
             self.status.set_content(status_html(job, {}, title))
             self.bar.set_value(share)
             self.chart.set_visibility(False)
             return
         cache = self._cache
-        live, news = await self.work.beside(_update, out, cache)
+        live, news = await self.work.in_thread(_update, out, cache)
         if cache is not self._cache:  # another run has been selected meanwhile
             return
         self.status.set_content(status_html(job, live))

@@ -120,7 +120,7 @@ class MaskCard:
                 if drawings:
                     write_masks(folder, drawings, sizes)
 
-            await self.work.beside(work)
+            await self.work.in_thread(work)
 
     def _show_views(self) -> None:
         views = ", ".join(self.edits.drawings) or "no view"
@@ -131,7 +131,7 @@ class MaskCard:
         with refusals():
             record = self.job.view.record()
             settings: MaskSettings = record.masks
-            address = await self.work.beside(threshold_address, self.measurement, index, settings, record.sigma)
+            address = await self.work.in_thread(threshold_address, self.measurement, index, settings, record.sigma)
             with dialog():
                 text_html(f"Threshold mask of view {self.view.value}; white: flow", "h3")
                 image = ui.element("img").style("width: min(70vw, 600px); image-rendering: pixelated")

@@ -12,7 +12,7 @@ from urllib.parse import quote, urlencode
 from starlette.requests import Request
 from starlette.responses import FileResponse, PlainTextResponse, Response
 
-from nerif.app.sources import source_of
+from nerif.app.result_volumes import source_of
 from nerif.app.workspace import Workspace
 from nerif.common.conventions import InputError
 from nerif.report.isosurface import default_level, stl_of, surface_triangles
@@ -73,7 +73,7 @@ def _surface(work: Workspace) -> Answer:
         query = request.query_params
         try:
             level, frame = float(query.get("level", "0")), int(query.get("frame", "0"))
-            stl = await work.beside(made, query.get("of", ""), query.get("quantity", ""), level, frame)
+            stl = await work.in_thread(made, query.get("of", ""), query.get("quantity", ""), level, frame)
         except (InputError, ValueError) as error:
             return PlainTextResponse(str(error), 404)
         return Response(stl, media_type="model/stl", headers={"cache-control": CACHE})
@@ -91,7 +91,7 @@ def _live(work: Workspace) -> Answer:
 
     async def answer(request: Request) -> Response:
         try:
-            stl = await work.beside(made, request.query_params.get("of", ""))
+            stl = await work.in_thread(made, request.query_params.get("of", ""))
         except InputError as error:
             return PlainTextResponse(str(error), 404)
         return Response(stl, media_type="model/stl", headers={"cache-control": CACHE})

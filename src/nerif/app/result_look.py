@@ -13,10 +13,10 @@ from nicegui import ui
 
 from nerif.analysis.resampling import common_grid, difference, resampled
 from nerif.app.elements import select, text_html
-from nerif.app.range_slider import RangeSlider
+from nerif.app.result_volumes import Source, source_of
 from nerif.app.slices_view import Panel, SlicesView
-from nerif.app.sources import Source, source_of
-from nerif.app.surface_view import Surface, SurfaceView
+from nerif.app.sliders import RangeSlider
+from nerif.app.surfaces import Surface, SurfaceView
 from nerif.app.workspace import Workspace
 from nerif.common.conventions import InputError, unit_shown
 from nerif.data.volume import Volume, describe
@@ -55,7 +55,7 @@ class ResultLook:
     async def build(self) -> None:
         """Build controls and images, or the reason why there are none."""
         try:
-            self.source = await self.work.beside(self._open, self.name)
+            self.source = await self.work.in_thread(self._open, self.name)
             quantities = [q for q in self.source.quantities if not q.endswith("_std")]
         except InputError as error:
             text_html(f"{error}.", classes="note")
@@ -136,7 +136,7 @@ class ResultLook:
         self.spread.set_visibility(available)
         quantity = f"{self.quantity.value}_std" if available and self.spread.value else self.quantity.value
         try:
-            panels, note = await self.work.beside(self._panels, quantity, self.against.value, self.step)
+            panels, note = await self.work.in_thread(self._panels, quantity, self.against.value, self.step)
         except InputError as error:
             panels, note = [], f"{error}."
         self.note.set_content(f"<p class=note>{escape(note)}</p>" if note else "")
@@ -195,14 +195,14 @@ class ResultLook:
             text_html("There is no field to show yet.", classes="note")
             return
         quantity, against = self.quantity.value, self.against.value
-        volume, limits, level = await self.work.beside(self._volume, quantity)
+        volume, limits, level = await self.work.in_thread(self._volume, quantity)
         if min(volume.grid.shape) < 2:
             text_html("The field is a plane and has no isosurface.", classes="note")
             return
         view = SurfaceView(quantity, _unit(volume), limits, level, volume.grid.box)
         surfaces = [self._surface_of(self.name, self.frame)]
         if against:
-            other = await self.work.beside(self._open, against)
+            other = await self.work.in_thread(self._open, against)
             surfaces.append(self._surface_of(against, self._at(other, against, self.step)))
         view.show(surfaces)
 

@@ -11,6 +11,7 @@ import numpy as np
 from nicegui import ui
 
 from nerif.app.elements import table_html, text_html
+from nerif.app.surfaces import scene_of
 from nerif.common.conventions import InputError
 from nerif.geometry import Box, Camera
 from nerif.imaging.calibration.importers.importers import import_box, import_cameras
@@ -60,9 +61,7 @@ def show_rig(rig: Rig) -> None:
         text_html(text, classes="note")
     if not rig.cameras:
         return
-    camera = ui.scene.perspective_camera(fov=38)
-    scene = ui.scene(width=1080, height=460, grid=False, camera=camera, background_color="#eef1f4")
-    scene.classes("surface").props('role=img aria-label="The rig; drag to turn, scroll to zoom"')
+    scene = scene_of("The rig; drag to turn, scroll to zoom", 1080, 460)
     middle = np.zeros(3) if rig.box is None else np.array(rig.box.centre)
     outlines = [image_corners(c, middle) for c in rig.cameras]
     points = np.concatenate([np.concatenate([s.start, s.end]) for s in outlines] + [middle[None]])

@@ -19,9 +19,9 @@ from nicegui import app, background_tasks, ui
 from nicegui.server import Server
 from starlette.responses import RedirectResponse
 
-from nerif.app.frame import frame
+from nerif.app.frame import Page, frame
 from nerif.app.guard import Guard
-from nerif.app.pages import PAGES, Page
+from nerif.app.pages import PAGES
 from nerif.app.private import page_leading_to
 from nerif.app.project import Project
 from nerif.app.result_answers import ROUTES
@@ -108,7 +108,7 @@ def serve(folder: Path, address: Address, browser: bool = True) -> None:
             webbrowser.open(first)
 
     app.on_startup(lambda: background_tasks.create(begun()))
-    app.on_startup(lambda: work.beside(work.project.contents))  # fills the cache: the first search takes longest
+    app.on_startup(work.contents)  # fills the cache: the first search takes longest
     app.timer(QUEUE_EVERY, work.jobs.advance)
     with ExitStack() as ending:
         first = ending.enter_context(page_leading_to(address.link)) if browser else ""

@@ -9,7 +9,7 @@ from typing import Any
 
 from nicegui import ui
 
-from nerif.app.range_slider import RangeSlider
+from nerif.app.sliders import RangeSlider
 from nerif.app.workspace import Workspace
 from nerif.data.volume import Volume
 from nerif.geometry import Grid
@@ -110,7 +110,7 @@ class SlicesView:
             while self._waiting:
                 normal = self._waiting.pop()
                 panels, index = self.panels, self._index(normal) if self.panels else 0
-                addresses = await self.work.beside(_slice_addresses, panels, normal, index)
+                addresses = await self.work.in_thread(_slice_addresses, panels, normal, index)
                 if panels is self.panels:
                     self._put(normal, index, addresses)
         finally:

@@ -57,7 +57,7 @@ class TargetImages:
                     text_html(f"{title}: there is no {view.name}/{source}.", classes="note")
                 continue
             try:
-                names = await self.work.beside(_poses, view, source)
+                names = await self.work.in_thread(_poses, view, source)
             except InputError as error:
                 with self._place:
                     text_html(str(error), classes="note")
@@ -70,9 +70,9 @@ class TargetImages:
             for number, pose in enumerate(names):
                 name = f"{view.name}/{source}/{pose}"
                 try:
-                    address = await self.work.beside(self.files.image, view, source, number, LARGEST, view.crop)
-                    detection = await self.work.beside(self.files.result, view, source, number, targets[source])
-                    shape = await self.work.beside(self._shape, view, source)
+                    address = await self.work.in_thread(self.files.image, view, source, number, LARGEST, view.crop)
+                    detection = await self.work.in_thread(self.files.result, view, source, number, targets[source])
+                    shape = await self.work.in_thread(self._shape, view, source)
                 except InputError as error:
                     with grid:
                         text_html(str(error), classes="missing note")

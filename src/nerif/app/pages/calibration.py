@@ -11,9 +11,9 @@ from nicegui import ui
 from nerif.app.elements import CommandLine, card, refusals, select, text_html
 from nerif.app.form_view import FormView
 from nerif.app.forms import Form
-from nerif.app.job_status import JobStatus
+from nerif.app.frame import Page
+from nerif.app.job_form import JobStatus
 from nerif.app.jobs import Job
-from nerif.app.pages.page import Page
 from nerif.app.project import Contents
 from nerif.app.rig_scene import read_rig, show_rig
 from nerif.app.target_images import TargetImages
@@ -121,7 +121,7 @@ class CalibrationPage:
         self.views = {}
         if self.experiment.value:
             with refusals():
-                outcome = await self.work.beside(self.work.project.views, self.experiment.value)
+                outcome = await self.work.in_thread(self.work.project.views, self.experiment.value)
                 self.views = {view.name: view for view in outcome}
         settings: dict[str, Any] = {}
         if self.settings:
@@ -196,7 +196,7 @@ class CalibrationPage:
     async def _ended(self, job: Job) -> None:
         """Show what the run wrote."""
         if job.state == "done":
-            self.outcome = await self.work.beside(self.work.project.contents)
+            self.outcome = await self.work.contents()
             await self._choose_calibration(self.work.project.relative(job.file))
             await self._draw()
         self._show()
@@ -215,7 +215,7 @@ class CalibrationPage:
         lines = [] if name else ["There is no calibration in this folder yet."]
         if name:
             with refusals(lines.append):
-                rig = await self.work.beside(read_rig, self.work.project.path(name))
+                rig = await self.work.in_thread(read_rig, self.work.project.path(name))
         if turn != self.turn:  # another one has been chosen meanwhile
             return
         self.errors = {error.name: error for error in rig.errors} if rig else {}
@@ -254,7 +254,7 @@ class CalibrationPage:
 
 async def build(work: Workspace) -> None:
     """Build the page."""
-    page = CalibrationPage(work, await work.beside(work.project.contents))
+    page = CalibrationPage(work, await work.contents())
     with ui.element("div"):
         ui.timer(0.01, page.build, once=True)  # the page is there before its images are looked through
 

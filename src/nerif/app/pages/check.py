@@ -11,9 +11,8 @@ from nerif.analysis.consistency import Consistency, check_consistency
 from nerif.app.elements import CommandLine, FileChoice, card, items_html, refusals, table_html, text_html
 from nerif.app.form_view import FormView
 from nerif.app.forms import Form
-from nerif.app.job_form import JobForm
-from nerif.app.job_status import JobStatus
-from nerif.app.pages.page import Page
+from nerif.app.frame import Page
+from nerif.app.job_form import JobForm, JobStatus
 from nerif.app.workspace import Workspace
 from nerif.cli.commands.check import Check
 from nerif.data.measurement import Measurement
@@ -43,7 +42,7 @@ class CheckPage:
             with ui.element("div").classes("stack"):
                 with card("Do the views agree?", AGREE), ui.element("div").classes("form"):
                     self.choice = FileChoice(
-                        "Measurement", measurements, memory.get("measurement"), self._there, self._turned
+                        "Measurement", measurements, memory.get("measurement"), work.measurements, self._turned
                     )
                     self.form = FormView(Form(self._record(), only=COMPARED), self._changed, memory.get("values"))
                     self.button = ui.button("Compare the views", icon="rule", on_click=self.compare)
@@ -65,9 +64,6 @@ class CheckPage:
                     self.correcting = JobStatus(work, f"{PAGE.name}.undone", offer=self.choice.choose)
         self.correction.set_visibility(bool(self.correcting.job))
         self.show()
-
-    async def _there(self) -> Sequence[str]:
-        return (await self.work.beside(self.work.project.contents)).measurements
 
     def _keep(self) -> None:
         values = self.form.form.changed(self.form.values)
@@ -122,7 +118,7 @@ class CheckPage:
                 measurement = Measurement.read(self.work.project.path(name))
                 return check_consistency(measurement, request.voxels, step, request.aperture)
 
-            result = await self.work.beside(work)
+            result = await self.work.in_thread(work)
         timer.cancel()
         self.button.enable()
         self.notice.clear()
@@ -174,11 +170,11 @@ def views_table(result: Consistency) -> str:
 
 async def build(work: Workspace) -> None:
     """Build the page."""
-    contents = await work.beside(work.project.contents)
-    if not contents.measurements:
+    measurements = await work.measurements()
+    if not measurements:
         text_html("There is no measurement in the folder yet: Displacement makes one of images.", classes="status")
         return
-    CheckPage(work, contents.measurements)
+    CheckPage(work, measurements)
 
 
 PAGE = Page("check", "Check", "/check", "Mistakes that cost a day, found before the reconstruction.", build)

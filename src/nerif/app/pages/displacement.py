@@ -11,9 +11,9 @@ from nicegui import ui
 
 from nerif.app.elements import FileChoice, card, refusals, select, text_html
 from nerif.app.forms import Form
+from nerif.app.frame import Page
 from nerif.app.job_form import JobForm
 from nerif.app.mask_card import MaskCard
-from nerif.app.pages.page import Page
 from nerif.app.project import Contents
 from nerif.app.view_maps import maps_html
 from nerif.app.workspace import Workspace
@@ -73,7 +73,7 @@ class DisplacementPage:
 
     async def _go_on(self, file: str) -> None:
         """Show a measurement that a run has written, and give the next one a new name."""
-        self._show((await self.work.beside(self.work.project.contents)).measurements)
+        self._show(await self.work.measurements())
         if self.measured is not None:
             await self.measured.choice.choose(file)
         self.out.set_value(self.work.project.free_name("measurement.nc"))
@@ -116,7 +116,7 @@ class DisplacementPage:
                 measurement, _ = measure_instant(request.recording(), numbers, lines.append, processes=1)
                 return maps_html(measurement)
 
-            html = await self.work.beside(work)
+            html = await self.work.in_thread(work)
         self.button.enable()
         self.display.clear()
         with self.display:
@@ -145,7 +145,7 @@ class MeasurementCard:
         memory = work.draft(PAGE.name).get("measurement")
         with card("What was measured"):
             first = memory if memory in measurements else measurements[-1]
-            self.choice = FileChoice("Measurement", measurements, first, self._there, self._turned)
+            self.choice = FileChoice("Measurement", measurements, first, work.measurements, self._turned)
             self.choice.select.classes("short")
             self.fold = ui.expansion("Maps of all views", icon="grid_view", on_value_change=self._maps).classes("wide")
             with self.fold:
@@ -159,9 +159,6 @@ class MeasurementCard:
         """Of the measurement that is chosen."""
         return self.choice.name
 
-    async def _there(self) -> Sequence[str]:
-        return (await self.work.beside(self.work.project.contents)).measurements
-
     def _read(self, name: str) -> Measurement:
         return self.work.project.cached(name, "measurement", Measurement.read)
 
@@ -174,7 +171,7 @@ class MeasurementCard:
     async def _measurement(self) -> tuple[str, Measurement] | None:
         """Read what is chosen; None if another one has been chosen meanwhile."""
         name = self.name
-        measurement = await self.work.beside(self._read, name)
+        measurement = await self.work.in_thread(self._read, name)
         return (name, measurement) if name == self.name else None
 
     async def _maps(self) -> None:
@@ -184,7 +181,7 @@ class MeasurementCard:
         with refusals():
             if (selection := await self._measurement()) is None:
                 return
-            html = await self.work.beside(maps_html, selection[1])
+            html = await self.work.in_thread(maps_html, selection[1])
             if selection[0] != self.name:
                 return
             self.maps.clear()
@@ -203,7 +200,7 @@ class MeasurementCard:
 
 async def build(work: Workspace) -> None:
     """Build the page."""
-    DisplacementPage(work, await work.beside(work.project.contents))
+    DisplacementPage(work, await work.contents())
 
 
 PAGE = Page("displacement", "Displacement", "/displacement", "How far the background is shifted, view by view.", build)

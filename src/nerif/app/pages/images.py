@@ -12,8 +12,8 @@ from nerif.app.blink import Blink
 from nerif.app.crop_editor import CropEditor
 from nerif.app.crop_edits import CropEdits
 from nerif.app.elements import CommandLine, card, items_html, refusals, select, text_html
+from nerif.app.frame import Page
 from nerif.app.histogram import histogram
-from nerif.app.pages.page import Page
 from nerif.app.workspace import Workspace
 from nerif.common.conventions import InputError
 from nerif.imaging.image_quality import ImageQuality
@@ -62,7 +62,7 @@ class ImagesPage:
         self.turn += 1
         turn = self.turn
         with refusals():
-            outcome = await self.work.beside(self.work.project.views, self.experiment)
+            outcome = await self.work.in_thread(self.work.project.views, self.experiment)
             self.views = {view.name: view for view in outcome}
         written = {name: view.crop or Crop() for name, view in self.views.items()}
         self.edits = CropEdits(written, self.memory.get(self.experiment))
@@ -102,7 +102,7 @@ class ImagesPage:
         looks: dict[str, ImageQuality] = {}
         for source in SOURCES:
             try:
-                looks[source] = await self.work.beside(self.files.look, view, source, self.most)
+                looks[source] = await self.work.in_thread(self.files.look, view, source, self.most)
             except InputError as error:
                 wrong.append(str(error))
         wrong += [f"{name}: {why}" for look in looks.values() for name, why in look.bad]
@@ -110,7 +110,7 @@ class ImagesPage:
         images: dict[str, str] = {}
         for source, look in looks.items():
             with refusals(wrong.append):
-                images[source] = await self.work.beside(
+                images[source] = await self.work.in_thread(
                     self.files.image, view, source, look.first, THUMBNAIL, view.crop
                 )
         if turn != self.turn:
@@ -149,10 +149,10 @@ class ImagesPage:
         frame, address = (0, 0), ""
         for source in SOURCES:
             with refusals(messages.append):
-                look = await self.work.beside(self.files.look, view, source, self.most)
+                look = await self.work.in_thread(self.files.look, view, source, self.most)
                 first[source] = look.first
                 if not address:
-                    address = await self.work.beside(self.files.image, view, source, look.first, LARGE, None)
+                    address = await self.work.in_thread(self.files.image, view, source, look.first, LARGE, None)
                     frame = look.frame_shape
         if turn != self.closer_turn:  # another view has been chosen meanwhile
             return
@@ -222,7 +222,7 @@ class ImagesPage:
         display: dict[str, str] = {}
         for source, first in self.first.items():
             with refusals():
-                display[source] = await self.work.beside(self.files.image, view, source, first, LARGE, crop)
+                display[source] = await self.work.in_thread(self.files.image, view, source, first, LARGE, crop)
         if display and (view, crop) == (self.views.get(self.selection), self.edits.now.get(self.selection)):
             one = next(iter(display.values()))
             self.blink.show(display.get("reference", one), display.get("flow", one))
@@ -230,7 +230,7 @@ class ImagesPage:
     async def _save(self) -> None:
         with refusals():
             folder = self.work.project.path(self.experiment)
-            await self.work.beside(write_crops, folder, self.edits.changed)
+            await self.work.in_thread(write_crops, folder, self.edits.changed)
             self.memory[self.experiment] = {**self.edits.draft, "now": {}}
             ui.notify(f"{self.experiment}/views.toml is written.", type="positive")
             await self.build()
@@ -257,7 +257,7 @@ def _figure(view: View, source: str, look: ImageQuality | None, address: str) ->
 
 async def build(work: Workspace) -> None:
     """Build the page."""
-    outcome = await work.beside(work.project.contents)
+    outcome = await work.contents()
     if not outcome.experiments:
         with card("In this folder"):
             text_html("There are no images in this folder yet. " + LAYOUT, classes="note")

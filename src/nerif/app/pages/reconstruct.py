@@ -13,8 +13,8 @@ from nicegui import ui
 from nerif.app.elements import CommandLine, FileChoice, card, refusals, select, text_html
 from nerif.app.form_view import FormView
 from nerif.app.forms import Form
+from nerif.app.frame import Page
 from nerif.app.live_view import LiveView
-from nerif.app.pages.page import Page
 from nerif.app.workspace import Workspace
 from nerif.cli.commands.reconstruct import COMMANDS, Reconstruct
 from nerif.cli.commands.sequence import Sequence
@@ -153,8 +153,8 @@ async def build(work: Workspace) -> None:
 
 async def _measurements(work: Workspace) -> tuple[str, ...]:
     """What can be reconstructed: measurements, and films of them."""
-    result = await work.beside(work.project.contents)
-    films = [name for name in result.films if await work.beside(_measured, work, name)]
+    result = await work.contents()
+    films = [name for name in result.films if await work.in_thread(_measured, work, name)]
     return (*result.measurements, *films)
 
 

@@ -11,10 +11,9 @@ from nicegui import ui
 
 from nerif.app.elements import CommandLine, card, figures, refusals, select, text_html
 from nerif.app.forms import Form
-from nerif.app.job_form import JobForm
-from nerif.app.job_status import JobStatus
+from nerif.app.frame import Page
+from nerif.app.job_form import JobForm, JobStatus
 from nerif.app.jobs import Job
-from nerif.app.pages.page import Page
 from nerif.app.result_answers import report_address, report_file
 from nerif.app.result_look import ResultLook
 from nerif.app.result_table import Row, result_table, rows_of
@@ -203,8 +202,7 @@ class ResultsPage:
 
 async def build(work: Workspace) -> None:
     """Build the page."""
-    outcome = await work.beside(work.project.contents)
-    page = ResultsPage(work, await work.beside(rows_of, work.project, outcome))
+    page = ResultsPage(work, await work.in_thread(rows_of, work.project, await work.contents()))
     await page.build()
 
 

@@ -17,7 +17,7 @@ from nerif.report.movie import finished_frames, ranges_over_time
 from nerif.report.packing import coarsen
 from nerif.results.directory import VOLUME
 
-__all__ = ["Film", "Source", "Still", "source_of"]
+__all__ = ["Film", "Source", "Still", "film_progress", "source_of"]
 
 Limits = tuple[float, float]
 
@@ -102,6 +102,18 @@ class Film:
 def source_of(path: Path) -> Source:
     """Open a result directory or a store over time."""
     return Film(path) if path.suffix == ".zarr" else Still(path)
+
+
+def film_progress(path: Path) -> tuple[float, str]:
+    """Return the fraction of complete frames of a film, and the count as text; 0 and empty before there is a store."""
+    if not (path / "zarr.json").is_file():
+        return 0.0, ""
+    try:
+        store = VolumeSequence(path)
+    except InputError:  # incomplete
+        return 0.0, ""
+    done, count = len(finished_frames(store)), len(store)
+    return done / max(count, 1), f"{done} of {count} frames"
 
 
 def _worth_showing(quantities: Sequence[str] | dict[str, Volume]) -> tuple[str, ...]:
