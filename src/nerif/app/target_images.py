@@ -71,7 +71,7 @@ class TargetImages:
                 name = f"{view.name}/{source}/{pose}"
                 try:
                     address = await self.work.in_thread(self.files.image, view, source, number, LARGEST, view.crop)
-                    detection = await self.work.in_thread(self.files.result, view, source, number, targets[source])
+                    detection = await self.work.in_thread(self.files.detection, view, source, number, targets[source])
                     shape = await self.work.in_thread(self._shape, view, source)
                 except InputError as error:
                     with grid:

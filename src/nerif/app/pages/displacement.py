@@ -13,7 +13,7 @@ from nerif.app.elements import FileChoice, card, refusals, select, text_html
 from nerif.app.forms import Form
 from nerif.app.frame import Page
 from nerif.app.job_form import JobForm
-from nerif.app.mask_card import MaskCard
+from nerif.app.mask_editor import MaskCard
 from nerif.app.project import Contents
 from nerif.app.view_maps import maps_html
 from nerif.app.workspace import Workspace
