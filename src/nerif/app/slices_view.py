@@ -49,7 +49,7 @@ class SlicesView:
         self._at = dict.fromkeys(NORMALS, 0.5)  # position along each axis, relative to its length
         self._waiting: set[str] = set()
         self._busy = False
-        self._built: tuple[Any, ...] = ()
+        self._layout: tuple[Any, ...] = ()
         self._images: dict[tuple[str, int], Any] = {}
         self._bars = ui.html("", sanitize=False)
         self._place = ui.element("div")
@@ -57,9 +57,9 @@ class SlicesView:
     async def show(self, panels: Sequence[Panel]) -> None:
         """Replace the panels; the slice positions stay."""
         self.panels = panels
-        built = tuple(p.title for p in panels), panels[0].volume.grid if panels else None
-        if built != self._built:
-            self._built = built
+        layout = tuple(p.title for p in panels), panels[0].volume.grid if panels else None
+        if layout != self._layout:
+            self._layout = layout
             self._build()
         self._bars.set_content(_bars(panels))
         self._waiting |= set(NORMALS)

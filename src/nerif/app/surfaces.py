@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from nicegui import ui
 
-from nerif.app.result_answers import live_address, surface_address
+from nerif.app.routes import live_address, surface_address
 from nerif.app.sliders import RangeSlider
 from nerif.common.conventions import unit_shown
 from nerif.data.volume import describe, name_of

@@ -27,17 +27,17 @@ class TargetImages:
     Parameters
     ----------
     work : Workspace
-    toggled : called with the name of an image that is excluded or included
+    on_toggle : called with the name of an image that is excluded or included
     """
 
-    def __init__(self, work: Workspace, toggled: Callable[[str], None]) -> None:
-        self.work, self.files, self._toggled = work, work.files, toggled
-        self._turn = 0
+    def __init__(self, work: Workspace, on_toggle: Callable[[str], None]) -> None:
+        self.work, self.files, self._on_toggle = work, work.files, on_toggle
+        self._request = 0
         self._place = ui.element("div").classes("stack")
 
     async def show(
         self, view: View, targets: Mapping[str, CalibrationTarget], errors: Mapping[str, ImageError],
-        excluded: Collection[str],
+        exclusions: Collection[str],
     ) -> None:  # fmt: skip
         """Show the images of a view one after the other; a later call replaces an earlier one.
 
@@ -46,10 +46,10 @@ class TargetImages:
         view : view of an experiment
         targets : targets in space and on the background
         errors : errors by the name of the image
-        excluded : names of images
+        exclusions : names of images
         """
-        self._turn += 1
-        turn = self._turn
+        self._request += 1
+        request = self._request
         self._place.clear()
         for source, title in SOURCES.items():
             if source not in view.sources:
@@ -62,7 +62,7 @@ class TargetImages:
                 with self._place:
                     text_html(str(error), classes="note")
                 continue
-            if turn != self._turn:
+            if request != self._request:
                 return
             with self._place, ui.element("div"):
                 text_html(title, "h3")
@@ -77,10 +77,10 @@ class TargetImages:
                     with grid:
                         text_html(str(error), classes="missing note")
                     continue
-                if turn != self._turn:
+                if request != self._request:
                     return
                 with grid:
-                    self._cell(name, address, detection, shape, errors, name in excluded)
+                    self._cell(name, address, detection, shape, errors, name in exclusions)
 
     def _shape(self, view: View, source: str) -> tuple[int, int]:
         shape = view.open(source).shape
@@ -88,9 +88,9 @@ class TargetImages:
 
     def _cell(
         self, name: str, address: str, detection: Detection | None, shape: tuple[int, int],
-        errors: Mapping[str, ImageError], excluded: bool,
+        errors: Mapping[str, ImageError], exclusion: bool,
     ) -> None:  # fmt: skip
-        with ui.element("div").classes("target left-out" if excluded else "target") as cell:
+        with ui.element("div").classes("target left-out" if exclusion else "target") as cell:
             error = _error_html(errors.get(name)) or (", not used" if errors and detection is not None else "")
             count = "no target found" if detection is None else f"{len(detection.points)} points found"
             with ui.element("figure"):
@@ -101,7 +101,7 @@ class TargetImages:
                 )  # fmt: skip
             if detection is None:
                 return
-            state = [excluded]
+            state = [exclusion]
             button = ui.button().props("outline no-caps dense")
 
             def update() -> None:
@@ -115,7 +115,7 @@ class TargetImages:
             def toggle() -> None:
                 state[0] = not state[0]
                 update()
-                self._toggled(name)
+                self._on_toggle(name)
 
             button.on_click(toggle)
             update()

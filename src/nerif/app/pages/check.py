@@ -21,9 +21,9 @@ __all__ = ["PAGE"]
 
 AGREE = "Each is predicted by a quick reconstruction from the others."
 REFINE = "Cameras are refined with a quick field: which one is off?"
-COMPARED = ("voxels", "aperture")
-REFINED_LINES = 60  # of its output: a table of the views and the findings
-REFINED = ("pose_sigma_mm", "pose_sigma_deg", "time_limit", "aperture")
+VIEW_SETTINGS = ("voxels", "aperture")
+RIG_LINES = 60  # of its output: a table of the views and the findings
+RIG_SETTINGS = ("pose_sigma_mm", "pose_sigma_deg", "time_limit", "aperture")
 
 
 class CheckPage:
@@ -37,21 +37,20 @@ class CheckPage:
 
     def __init__(self, work: Workspace, measurements: Sequence[str]) -> None:
         self.work = work
-        memory = work.draft(PAGE.name)
+        draft = work.draft(PAGE.name)
         with ui.element("div").classes("columns"):
             with ui.element("div").classes("stack"):
                 with card("Do the views agree?", AGREE), ui.element("div").classes("form"):
-                    self.choice = FileChoice(
-                        "Measurement", measurements, memory.get("measurement"), work.measurements, self._turned
-                    )
-                    self.form = FormView(Form(self._record(), only=COMPARED), self._changed, memory.get("values"))
+                    name = draft.get("measurement")
+                    self.choice = FileChoice("Measurement", measurements, name, work.measurements, self._on_choice)
+                    self.form = FormView(Form(self._record(), only=VIEW_SETTINGS), self._changed, draft.get("values"))
                     self.button = ui.button("Compare the views", icon="rule", on_click=self.compare)
                     self.button.props("unelevated no-caps")
                 with card("Is the rig as it was calibrated?", REFINE), ui.element("div").classes("form"):
                     record = replace(self._record(), refine=("cameras",))
                     self.rig = JobForm(
-                        work, f"{PAGE.name}.rig", Form(record, only=REFINED), self._refine_words, "Refine",
-                        lines=REFINED_LINES,
+                        work, f"{PAGE.name}.rig", Form(record, only=RIG_SETTINGS), self._refine_words, "Refine",
+                        lines=RIG_LINES,
                     )  # fmt: skip
             with ui.element("div").classes("stack"):
                 with card("The same on the command line"):
@@ -61,8 +60,8 @@ class CheckPage:
                     with self.notice:
                         text_html("The views have not been compared yet.", classes="status")
                 with card("Undone") as self.correction:
-                    self.correcting = JobStatus(work, f"{PAGE.name}.undone", offer=self.choice.choose)
-        self.correction.set_visibility(bool(self.correcting.job))
+                    self.correction_status = JobStatus(work, f"{PAGE.name}.undone", offer=self.choice.choose)
+        self.correction.set_visibility(bool(self.correction_status.job))
         self.show()
 
     def _keep(self) -> None:
@@ -89,9 +88,9 @@ class CheckPage:
         """Arguments of nerif that compare the views."""
         return ["check", self.choice.name, *self.form.arguments]
 
-    def _turned(self) -> None:
+    def _on_choice(self) -> None:
         self._keep()
-        self.correction.set_visibility(bool(self.correcting.job))
+        self.correction.set_visibility(bool(self.correction_status.job))
         self.notice.clear()
         self.show()
         self.rig.show()
@@ -128,7 +127,7 @@ class CheckPage:
             if result is not None:
                 self._show(name, arguments, result)
 
-    def _show(self, name: str, compared: Sequence[str], result: Consistency) -> None:
+    def _show(self, name: str, words: Sequence[str], result: Consistency) -> None:
         """The verdicts, and the correction that is offered."""
         ui.html(views_table(result), sanitize=False)
         if result.findings:
@@ -139,14 +138,14 @@ class CheckPage:
             ui.html(f"<h3>Notes</h3>{items_html(result.remarks, '')}", sanitize=False)
         if result.corrections:
             out = self.work.project.free_name(f"{name.removesuffix('.nc')}.corrected.nc")
-            arguments = [*compared, "--out", out]
+            arguments = [*words, "--out", out]
             text_html("The mistakes can be undone, in a new file:", "h3")
             line = CommandLine()
             line.show(arguments)
 
             def correct() -> None:
                 with refusals():
-                    self.correcting.follow(self.work.jobs.add(arguments, f"Correct {name}"))
+                    self.correction_status.follow(self.work.jobs.add(arguments, f"Correct {name}"))
                     self.correction.set_visibility(True)
                     button.disable()
 

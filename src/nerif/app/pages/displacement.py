@@ -33,12 +33,12 @@ class DisplacementPage:
     Parameters
     ----------
     work : Workspace
-    contents : of the project
+    contents : files of the project
     """
 
     def __init__(self, work: Workspace, contents: Contents) -> None:
         self.work, draft = work, work.draft(PAGE.name)
-        self.measured: MeasurementCard | None = None
+        self.measurement_card: MeasurementCard | None = None
         if contents.experiments and contents.calibrations:
             with ui.element("div").classes("columns"):
                 with card("Images to displacements"), ui.element("div").classes("form"):
@@ -53,7 +53,7 @@ class DisplacementPage:
                         lambda: str(self.out.value), offer=self._go_on,
                     )  # fmt: skip
                     for control in (self.experiment, self.calibration, self.out):
-                        control.on_value_change(self._turned)
+                        control.on_value_change(self._on_choice)
                 with card("Preview of one view", "With these settings, before all views are done."):
                     self.view = select("View", []).classes("short")
                     self.button = ui.button("Preview", icon="visibility", on_click=self.preview)
@@ -67,15 +67,15 @@ class DisplacementPage:
         self._show(contents.measurements)
 
     def _show(self, measurements: Sequence[str]) -> None:
-        if measurements and self.measured is None:
+        if measurements and self.measurement_card is None:
             with self.below:
-                self.measured = MeasurementCard(self.work, measurements)
+                self.measurement_card = MeasurementCard(self.work, measurements)
 
     async def _go_on(self, file: str) -> None:
         """Show a measurement that a run has written, and give the next one a new name."""
         self._show(await self.work.measurements())
-        if self.measured is not None:
-            await self.measured.choice.choose(file)
+        if self.measurement_card is not None:
+            await self.measurement_card.choice.choose(file)
         self.out.set_value(self.work.project.free_name("measurement.nc"))
 
     def _words(self) -> list[str]:
@@ -84,7 +84,7 @@ class DisplacementPage:
             "--out", str(self.out.value),
         ]  # fmt: skip
 
-    def _turned(self) -> None:
+    def _on_choice(self) -> None:
         selection = {"experiment": self.experiment.value, "calibration": self.calibration.value}
         self.work.keep(PAGE.name, {**self.work.draft(PAGE.name), **selection})
         self.job.show()
@@ -132,20 +132,20 @@ def _select(label: str, names: Sequence[str], draft: Mapping[str, Any]) -> ui.se
 
 
 class MeasurementCard:
-    """What a measurement holds, and masks drawn into it.
+    """Maps of the views of a measurement, and the editor of its masks.
 
     Parameters
     ----------
     work : Workspace
-    measurements : their names
+    measurements : names of the measurements
     """
 
     def __init__(self, work: Workspace, measurements: Sequence[str]) -> None:
         self.work = work
-        memory = work.draft(PAGE.name).get("measurement")
+        name = work.draft(PAGE.name).get("measurement")
         with card("What was measured"):
-            first = memory if memory in measurements else measurements[-1]
-            self.choice = FileChoice("Measurement", measurements, first, work.measurements, self._turned)
+            first = name if name in measurements else measurements[-1]
+            self.choice = FileChoice("Measurement", measurements, first, work.measurements, self._on_choice)
             self.choice.select.classes("short")
             self.fold = ui.expansion("Maps of all views", icon="grid_view", on_value_change=self._maps).classes("wide")
             with self.fold:
@@ -156,26 +156,26 @@ class MeasurementCard:
 
     @property
     def name(self) -> str:
-        """Of the measurement that is chosen."""
+        """Name of the selected measurement."""
         return self.choice.name
 
     def _read(self, name: str) -> Measurement:
         return self.work.project.cached(name, "measurement", Measurement.read)
 
-    async def _turned(self) -> None:
+    async def _on_choice(self) -> None:
         self.work.keep(PAGE.name, {**self.work.draft(PAGE.name), "measurement": self.name})
         self.maps.clear()
         await self._maps()
         await self._masks()
 
     async def _measurement(self) -> tuple[str, Measurement] | None:
-        """Read what is chosen; None if another one has been chosen meanwhile."""
+        """Read the selected measurement; None if another one has been selected meanwhile."""
         name = self.name
         measurement = await self.work.in_thread(self._read, name)
         return (name, measurement) if name == self.name else None
 
     async def _maps(self) -> None:
-        """Show the maps that are requested and not computed yet."""
+        """Show the maps unless they are folded or shown already."""
         if not self.fold.value or list(self.maps):
             return
         with refusals():

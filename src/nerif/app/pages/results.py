@@ -14,9 +14,9 @@ from nerif.app.forms import Form
 from nerif.app.frame import Page
 from nerif.app.job_form import JobForm, JobStatus
 from nerif.app.jobs import Job
-from nerif.app.result_answers import report_address, report_file
-from nerif.app.result_look import ResultLook
 from nerif.app.result_table import Row, result_table, rows_of
+from nerif.app.result_view import ResultView
+from nerif.app.routes import report_address, report_file
 from nerif.app.workspace import Workspace
 from nerif.cli.commands.export import Export
 from nerif.cli.commands.figures import Figures
@@ -82,17 +82,17 @@ class ResultsPage:
                 ui.html(figures([(a, b, "") for a, b in row.figures]), sanitize=False)
 
     async def _views(self) -> None:
-        memory = str(self.draft.get("tab", "slices"))
+        tab = str(self.draft.get("tab", "slices"))
         with ui.element("section").classes("card").props('aria-label="The result"'):
             with ui.tabs().props("no-caps align=left dense") as tabs:
                 for name, title in TABS.items():
                     ui.tab(name, title)
             others = [r.name for r in self.rows if r.name != self.row.name and r.film == self.row.film]
-            look = ResultLook(self.work, self.row.name, others, self.draft, self.keep)
-            first = memory if memory in TABS else "slices"
+            view = ResultView(self.work, self.row.name, others, self.draft, self.keep)
+            first = tab if tab in TABS else "slices"
             with ui.tab_panels(tabs, value=first, animated=False).classes("panels-of-tabs") as panels:
                 with ui.tab_panel("slices"):
-                    await look.build()
+                    await view.build()
                 with ui.tab_panel("surface"):
                     surface = ui.element("div").classes("stack")
                 with ui.tab_panel("report"):
@@ -100,17 +100,17 @@ class ResultsPage:
                 with ui.tab_panel("export"):
                     self._export()
 
-        async def turned() -> None:
+        async def on_change() -> None:
             self.draft["tab"] = panels.value
             self.keep()
             if panels.value == "surface":  # of what is chosen in the slices
                 surface.clear()
                 with surface, refusals():
-                    await look.surfaces()
+                    await view.surfaces()
 
-        panels.on_value_change(turned)
+        panels.on_value_change(on_change)
         if panels.value == "surface":
-            await turned()
+            await on_change()
 
     # -- report --------------------------------------------------------------------------------------------------
 
@@ -134,13 +134,13 @@ class ResultsPage:
             with refusals():
                 writing.follow(self.work.jobs.add(["report", name], f"Report {name}"))
 
-        async def written(job: Job) -> None:
+        async def on_end(job: Job) -> None:
             if job.state == "done":
                 await self.build()
 
         button = "Write it again" if file.is_file() else "Write the report"
         ui.button(button, icon="playlist_add", on_click=write).props("outline no-caps")
-        writing = JobStatus(self.work, f"{PAGE.name}.report {name}", written)
+        writing = JobStatus(self.work, f"{PAGE.name}.report {name}", on_end)
 
     # -- for others ----------------------------------------------------------------------------------------------
 
@@ -172,11 +172,11 @@ class ResultsPage:
         form = Form(record, without=("config", "result", "out", "force"))
         with ui.element("div").classes("form"):
             _, name = self._named("Format", {ending: PROGRAMS.get(ending, ending) for ending in FORMATS})
-            made = JobForm(
+            job_form = JobForm(
                 self.work, f"{PAGE.name}.export", form, lambda: ["export", self.row.name, "-o", name.value or "FILE"],
                 "Export", ("voxels", "quantities"), lambda: name.value, about=self.row.name,
             )  # fmt: skip
-        name.on_value_change(made.show)
+        name.on_value_change(job_form.show)
 
     def _figures(self) -> None:
         record = Figures(tyro.MISSING)
@@ -193,11 +193,11 @@ class ResultsPage:
         form = Form(record, without=("config", "result", "out", "force"), choices={"style": STYLES})
         with ui.element("div").classes("form"):
             _, name = self._named("Format", {".mp4": "H.264 (.mp4)", ".gif": "GIF (.gif)"})
-            made = JobForm(
+            job_form = JobForm(
                 self.work, f"{PAGE.name}.movie", form, lambda: ["movie", self.row.name, "-o", name.value or "FILE"],
                 "Make the movie", ("style", "every"), lambda: name.value, about=self.row.name,
             )  # fmt: skip
-        name.on_value_change(made.show)
+        name.on_value_change(job_form.show)
 
 
 async def build(work: Workspace) -> None:

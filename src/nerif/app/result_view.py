@@ -24,13 +24,13 @@ from nerif.plotting.drawing import DIVERGING, LABELS, map_range
 from nerif.report.slice_images import colours_of
 from nerif.results.directory import VOLUME
 
-__all__ = ["ResultLook"]
+__all__ = ["ResultView"]
 
 PLAY_EVERY = 0.25  # seconds a frame
 CLOSE = 0.5 + 1e-6  # of the frame interval: largest distance in time of frames that are compared
 
 
-class ResultLook:
+class ResultView:
     """The images of one result in one tab.
 
     Parameters
@@ -132,9 +132,9 @@ class ResultLook:
     async def draw(self) -> None:
         """Draw the selected quantity at the current step."""
         assert self.source is not None
-        available = f"{self.quantity.value}_std" in self.source.quantities
-        self.spread.set_visibility(available)
-        quantity = f"{self.quantity.value}_std" if available and self.spread.value else self.quantity.value
+        has_std = f"{self.quantity.value}_std" in self.source.quantities
+        self.spread.set_visibility(has_std)
+        quantity = f"{self.quantity.value}_std" if has_std and self.spread.value else self.quantity.value
         try:
             panels, note = await self.work.in_thread(self._panels, quantity, self.against.value, self.step)
         except InputError as error:
@@ -156,7 +156,7 @@ class ResultLook:
         other = self._open(against)
         if quantity not in other.quantities:
             raise InputError(f"it has no {describe(quantity)[1]} to compare with", field=against)
-        second = other.volume(quantity, self._at(other, against, step))
+        second = other.volume(quantity, self._nearest_frame(other, against, step))
         other_limits = other.limits(quantity)
         limits = min(limits[0], other_limits[0]), max(limits[1], other_limits[1])
         grid = common_grid(first, second)
@@ -172,7 +172,7 @@ class ResultLook:
         shape = " × ".join(str(n) for n in grid.shape[::-1])
         return panels, f"The grids differ: both fields are interpolated trilinearly to {shape} voxels (x, y, z)."
 
-    def _at(self, other: Source, against: str, step: int) -> int:
+    def _nearest_frame(self, other: Source, against: str, step: int) -> int:
         """The frame of another source that is nearest in time to a step."""
         source = self.source
         assert source is not None
@@ -203,7 +203,7 @@ class ResultLook:
         surfaces = [self._surface_of(self.name, self.frame)]
         if against:
             other = await self.work.in_thread(self._open, against)
-            surfaces.append(self._surface_of(against, self._at(other, against, self.step)))
+            surfaces.append(self._surface_of(against, self._nearest_frame(other, against, self.step)))
         view.show(surfaces)
 
     def _volume(self, quantity: str) -> tuple[Volume, tuple[float, float], float]:
