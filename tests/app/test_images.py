@@ -53,7 +53,7 @@ def test_steps_are_undone_and_kept():
     assert edits.now == {"a": one, "b": Crop()}
     again = Edits({"a": Crop(), "b": Crop()}, read, edits.draft)
     assert again.redo() == "a"
-    assert again.changed == {"a": other}
+    assert again.changes == {"a": other}
     again.put("b", other)
     assert again.redo() == ""
     assert Edits({"b": Crop()}, read, edits.draft).undo() == ""  # its view has gone

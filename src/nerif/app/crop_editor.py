@@ -156,13 +156,14 @@ class CropCard:
         """Show the images as they are cropped, and which crops are not in the folder yet."""
         self._on_change()
         view, crop = self.views[self.selection], self.edits.now[self.selection]
-        changed = self.edits.changed
+        changes = self.edits.changes
         self._undo.show()
-        self._save_button.set_enabled(bool(changed))
-        where = f"{self.experiment}/views.toml"
-        text = f"{where} is not written yet for {', '.join(changed)}: nerif displacement does not know it before."
-        done = "The commands see the views as they are shown here."
-        self._state.set_content(f"<p class=note role=status>{escape(text if changed else done)}</p>")
+        self._save_button.set_enabled(bool(changes))
+        text = "The commands see the views as they are shown here."
+        if changes:
+            where = f"{self.experiment}/views.toml"
+            text = f"{where} is not written yet for {', '.join(changes)}: nerif displacement does not know it before."
+        self._state.set_content(f"<p class=note role=status>{escape(text)}</p>")
         addresses: dict[str, str] = {}
         for source, first in self._first.items():
             with refusals():
@@ -174,7 +175,7 @@ class CropCard:
     async def _save(self) -> None:
         with refusals():
             folder = self.work.project.path(self.experiment)
-            await self.work.in_thread(write_crops, folder, self.edits.changed)
+            await self.work.in_thread(write_crops, folder, self.edits.changes)
             ui.notify(f"{self.experiment}/views.toml is written.", type="positive")
             await self._on_save()
 

@@ -37,10 +37,10 @@ class Edits(Generic[T]):
     def draft(self) -> dict[str, Any]:
         """The edits as JSON values, to be restored after a reload."""
         past, future = ([[name, _json(value)] for name, value in steps] for steps in (self.past, self.future))
-        return {"now": {name: _json(value) for name, value in self.changed.items()}, "past": past, "future": future}
+        return {"now": {name: _json(value) for name, value in self.changes.items()}, "past": past, "future": future}
 
     @property
-    def changed(self) -> dict[str, T]:
+    def changes(self) -> dict[str, T]:
         """Values that differ from the original ones."""
         return {name: value for name, value in self.now.items() if value != self.original[name]}
 

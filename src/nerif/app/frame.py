@@ -22,7 +22,7 @@ __all__ = ["JobsDrawer", "Page", "frame"]
 
 ASSETS = Path(__file__).parent / "assets"
 EVERY = 1.0  # seconds
-MOST = 30  # runs in the drawer
+LIMIT = 30  # runs in the drawer
 ACTIONS = {
     "running": ("pause", "stop"),
     "queued": ("first", "earlier", "later", "stop"),
@@ -146,7 +146,7 @@ class JobsDrawer:
         self._state = state
         self.place.clear()
         with self.place:
-            for job in jobs[:MOST]:
+            for job in jobs[:LIMIT]:
                 self._row(job, *progress[job.id])
             if not jobs:
                 text_html("No runs yet.", classes="note")

@@ -48,7 +48,7 @@ class ImageFiles:
 
     def quality(self, view: View, source: str) -> ImageQuality:
         """Return the quality of the images of a source; InputError if none can be used."""
-        return self._cached(view, source, ("quality",), lambda: image_quality(view, source, SAMPLE))
+        return self._from_cache(view, source, ("quality",), lambda: image_quality(view, source, SAMPLE))
 
     def image(self, view: View, source: str, number: int, largest: int, crop: Crop | None, white: float = 0.0) -> str:
         """Return a frame as the address of an image, cropped by `crop`."""
@@ -58,7 +58,7 @@ class ImageFiles:
             image = frames[number]
             return jpeg_address(crop(image, frames.name(number)) if crop else image, largest, white)
 
-        return self._cached(view, source, ("image", number, largest, crop, white), read)
+        return self._from_cache(view, source, ("image", number, largest, crop, white), read)
 
     def detection(self, view: View, source: str, number: int, target: CalibrationTarget) -> Detection | None:
         """Return the corners of a target in an image; None if it is not detected."""
@@ -67,9 +67,9 @@ class ImageFiles:
             frames = view.open(source)
             return target.detect(view.cropped(frames[number], frames.name(number)))
 
-        return self._cached(view, source, ("detection", number, target), read)
+        return self._from_cache(view, source, ("detection", number, target), read)
 
-    def _cached(self, view: View, source: str, what: tuple[Any, ...], read: Any) -> Any:
+    def _from_cache(self, view: View, source: str, what: tuple[Any, ...], read: Any) -> Any:
         key = str(Path(view.folder)), view.name, view.sources.get(source), source, view.crop, what
         stamp = self.stamp(view, source) if source in view.sources else ()
         with self._lock:

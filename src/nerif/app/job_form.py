@@ -46,7 +46,7 @@ class JobForm:
         offer: Callable[[str], Awaitable[None]] | None = None, lines: int = LINES,
     ) -> None:  # fmt: skip
         self.work, self.name, self.words, self.out, self.first = work, name, words, out, first
-        self.view = FormView(form, self._changed, work.draft(name), main)
+        self.view = FormView(form, self._on_change, work.draft(name), main)
         self.command = CommandLine()
         self.button = ui.button(button, icon="playlist_add", on_click=self._start).props("unelevated no-caps")
         self.status = JobStatus(work, f"{name}.run {about}".strip(), offer=offer, lines=lines)
@@ -63,7 +63,7 @@ class JobForm:
             self.command.show(self.arguments)
             self.button.set_enabled(self.view.valid)
 
-    def _changed(self) -> None:
+    def _on_change(self) -> None:
         self.work.keep(self.name, self.view.form.changed(self.view.values))
         self.show()
 

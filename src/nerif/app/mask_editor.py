@@ -63,7 +63,7 @@ class MaskCard:
         self.place = ui.element("div").classes("stack")
         self.status = ui.html("", sanitize=False).classes("status").props('aria-live="polite"')
         record = Mask(Path(name), Path("masked.nc"))
-        self._writing = asyncio.Lock()
+        self._lock = asyncio.Lock()
         form = Form(record, only=SETTINGS)
         self.job = JobForm(
             work, f"{page}.mask", form, self._words, "Apply the masks", SETTINGS[:1], first=self._write, about=name,
@@ -83,7 +83,7 @@ class MaskCard:
         return self.work.project.free_name(f"{self.name.removesuffix('.nc')}.masked.nc")
 
     def _words(self) -> list[str]:
-        option = ["--drawn", self.folder] if self.edits.changed else []
+        option = ["--drawn", self.folder] if self.edits.changes else []
         return ["mask", self.name, "--out", self.out, *option]
 
     def _build_editor(self) -> None:
@@ -109,16 +109,17 @@ class MaskCard:
         self.job.show()
         self.undo.show()
         self._show_views()
-        ui.timer(0.0, self._written, once=True)
 
-    async def _written(self) -> None:
-        with refusals():
-            await self._write()
+        async def write() -> None:
+            with refusals():
+                await self._write()
+
+        ui.timer(0.0, write, once=True)
 
     async def _write(self) -> None:
         """Write the masks as images in a thread, one write at a time."""
-        async with self._writing:
-            drawings, folder = self.edits.changed, self.work.project.path(self.folder)
+        async with self._lock:
+            drawings, folder = self.edits.changes, self.work.project.path(self.folder)
             sizes = {camera.name: camera.image_size for camera in self.measurement.cameras}
 
             def work() -> None:
@@ -130,7 +131,7 @@ class MaskCard:
             await self.work.in_thread(work)
 
     def _show_views(self) -> None:
-        views = ", ".join(self.edits.changed) or "no view"
+        views = ", ".join(self.edits.changes) or "no view"
         self.status.set_content(escape(f"Drawn in {views}."))
 
     async def _threshold(self) -> None:
@@ -153,7 +154,7 @@ class MaskEditor:
     name : name of the view
     shape : height and width, px
     address : address of its image
-    edits : shapes of all views, changed in place
+    edits : shapes of all views, changes in place
     on_change : called after each step
     """
 

@@ -31,7 +31,7 @@ CLOSE = 0.5 + 1e-6  # of the frame interval: largest distance in time of frames 
 
 
 class ResultView:
-    """The images of one result in one tab.
+    """The images of one result in one tab; `build` opens its source.
 
     Parameters
     ----------
@@ -46,9 +46,9 @@ class ResultView:
         self, work: Workspace, name: str, others: Sequence[str], draft: dict[str, Any], keep: Callable[[], None]
     ) -> None:
         self.work, self.name, self.others, self.draft, self.keep = work, name, tuple(others), draft, keep
-        self.source: Source | None = None
+        self.readable = False  # whether it has a field
         self.step = 0
-        self._playing: ui.timer | None = None
+        self._timer: ui.timer | None = None
 
     # -- controls ------------------------------------------------------------------------------------------------
 
@@ -63,6 +63,7 @@ class ResultView:
         if not quantities:
             text_html(f"{self.name}: it contains no field.", classes="note")
             return
+        self.readable = True
         quantity = str(self.draft.get("quantity", ""))
         options = {q: describe(q)[1].capitalize() for q in quantities}
         with ui.element("div").classes("choices"):
@@ -73,7 +74,6 @@ class ResultView:
             self.spread = ui.switch("Standard deviation", value=bool(self.draft.get("spread")))
         for control in (self.quantity, self.against, self.spread):
             control.on_value_change(self._update_draft)
-        self.time: RangeSlider | None = None
         if len(self.source.frames) > 1:
             self._build_time()
         self.note = ui.html("", sanitize=False).props("aria-live=polite")
@@ -82,7 +82,6 @@ class ResultView:
 
     def _build_time(self) -> None:
         source = self.source
-        assert source is not None
 
         async def move(step: int) -> None:
             self.step = step
@@ -98,20 +97,18 @@ class ResultView:
             self.time = RangeSlider("Time", len(source.frames) - 1, 0, text, move)
 
     def _play(self) -> None:
-        if self._playing is not None:
-            self._playing.cancel()
-            self._playing = None
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
             self.play.props("icon=play_arrow")
             return
 
         async def advance() -> None:
-            assert self.source is not None
-            assert self.time is not None
             self.step = (self.step + 1) % len(self.source.frames)
             self.time.put(self.step)
             await self.draw()
 
-        self._playing = ui.timer(PLAY_EVERY, advance)
+        self._timer = ui.timer(PLAY_EVERY, advance)
         self.play.props("icon=pause")
 
     async def _update_draft(self) -> None:
@@ -126,12 +123,10 @@ class ResultView:
     @property
     def frame(self) -> int:
         """The current frame; 0 for a result of one instant."""
-        assert self.source is not None
         return self.source.frames[self.step]
 
     async def draw(self) -> None:
         """Draw the selected quantity at the current step."""
-        assert self.source is not None
         has_std = f"{self.quantity.value}_std" in self.source.quantities
         self.spread.set_visibility(has_std)
         quantity = f"{self.quantity.value}_std" if has_std and self.spread.value else self.quantity.value
@@ -148,7 +143,6 @@ class ResultView:
     def _panels(self, quantity: str, against: str, step: int) -> tuple[list[Panel], str]:
         """The panels to draw side by side, and a note about them."""
         source = self.source
-        assert source is not None
         first, limits = source.volume(quantity, source.frames[step]), source.limits(quantity)
         unit, colours = _unit(first), colours_of(quantity)
         if not against:
@@ -175,7 +169,6 @@ class ResultView:
     def _nearest_frame(self, other: Source, against: str, step: int) -> int:
         """The frame of another source that is nearest in time to a step."""
         source = self.source
-        assert source is not None
         now = source.times[source.frames[step]]
         nearest = min(other.frames, key=lambda frame: abs(other.times[frame] - now))
         if abs(other.times[nearest] - now) > CLOSE * min(_interval(source.times), _interval(other.times)):
@@ -191,7 +184,7 @@ class ResultView:
 
     async def surfaces(self) -> None:
         """Build the isosurface of the selected quantity."""
-        if self.source is None:
+        if not self.readable:
             text_html("There is no field to show yet.", classes="note")
             return
         quantity, against = self.quantity.value, self.against.value
@@ -207,7 +200,6 @@ class ResultView:
         view.show(surfaces)
 
     def _volume(self, quantity: str) -> tuple[Volume, tuple[float, float], float]:
-        assert self.source is not None
         volume = self.source.volume(quantity, self.frame)
         return volume, self.source.limits(quantity), self.source.level(quantity)
 

@@ -53,7 +53,7 @@ class Still:
     @property
     def quantities(self) -> tuple[str, ...]:
         """Quantities to display: n only without its excess over ambient, standard deviations after their means."""
-        return _worth_showing(self._volumes)
+        return _display_names(self._volumes)
 
     def volume(self, quantity: str, frame: int = 0) -> Volume:
         """Return one quantity, averaged down if it is large."""
@@ -78,7 +78,7 @@ class Film:
         self.path = path
         store = VolumeSequence(path)
         self.times, self.frames = store.times, finished_frames(store)
-        self.quantities = _worth_showing(store.quantities)
+        self.quantities = _display_names(store.quantities)
         if not self.frames:
             raise InputError("no frame is complete yet", field=path.name)
 
@@ -116,7 +116,7 @@ def film_progress(path: Path) -> tuple[float, str]:
     return done / max(count, 1), f"{done} of {count} frames"
 
 
-def _worth_showing(quantities: Sequence[str] | dict[str, Volume]) -> tuple[str, ...]:
+def _display_names(quantities: Sequence[str] | dict[str, Volume]) -> tuple[str, ...]:
     names = [q for q in quantities if q.rpartition("_")[2] not in STATISTICS and (q != "n" or INDEX not in quantities)]
     return tuple(name for q in names for name in (q, f"{q}_std") if name in quantities)
 

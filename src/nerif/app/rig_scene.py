@@ -33,31 +33,31 @@ class Rig:
     Parameters
     ----------
     cameras : cameras that can be drawn
-    missing : data that the other cameras lack
+    gaps : data that the other cameras lack
     box : measurement volume
     errors : reprojection errors of the calibration images, empty if the file has none
     """
 
     cameras: tuple[Camera, ...]
-    missing: tuple[str, ...]
+    gaps: tuple[str, ...]
     box: Box | None
     errors: tuple[ImageError, ...]
 
 
 def read_rig(path: Path) -> Rig:
     """Read a calibration file."""
-    cameras, missing = [], []
+    cameras, gaps = [], []
     for camera in import_cameras(path):
         try:
             cameras.append(replace(camera, lens=None).camera())
         except InputError as error:
-            missing.append(str(error))
-    return Rig(tuple(cameras), tuple(missing), import_box(path), read_errors(path))
+            gaps.append(str(error))
+    return Rig(tuple(cameras), tuple(gaps), import_box(path), read_errors(path))
 
 
 def show_rig(rig: Rig) -> None:
     """Build the scene and the table."""
-    for text in rig.missing:
+    for text in rig.gaps:
         text_html(text, classes="note")
     if not rig.cameras:
         return

@@ -143,9 +143,9 @@ def _handler(work: Workspace, page: Page) -> Callable[[], Awaitable[None]]:
 
     async def build() -> None:
         with frame(work, page, PAGES):
-            pending = page.build(work)
-            if pending is not None:
-                await pending
+            coroutine = page.build(work)
+            if coroutine is not None:
+                await coroutine
 
     return build
 

@@ -47,7 +47,7 @@ class SlicesView:
         self.work = work
         self.panels: Sequence[Panel] = ()
         self._at = dict.fromkeys(NORMALS, 0.5)  # position along each axis, relative to its length
-        self._waiting: set[str] = set()
+        self._queue: set[str] = set()
         self._busy = False
         self._layout: tuple[Any, ...] = ()
         self._images: dict[tuple[str, int], Any] = {}
@@ -62,7 +62,7 @@ class SlicesView:
             self._layout = layout
             self._build()
         self._bars.set_content(_bars(panels))
-        self._waiting |= set(NORMALS)
+        self._queue |= set(NORMALS)
         await self._draw()
 
     def _build(self) -> None:
@@ -82,7 +82,7 @@ class SlicesView:
 
         async def move(index: int) -> None:
             self._at[normal] = (index + 0.5) / len(along)
-            self._waiting.add(normal)
+            self._queue.add(normal)
             await self._draw()
 
         RangeSlider(
@@ -107,8 +107,8 @@ class SlicesView:
             return
         self._busy = True
         try:
-            while self._waiting:
-                normal = self._waiting.pop()
+            while self._queue:
+                normal = self._queue.pop()
                 panels, index = self.panels, self._index(normal) if self.panels else 0
                 addresses = await self.work.in_thread(_slice_addresses, panels, normal, index)
                 if panels is self.panels:
@@ -131,11 +131,11 @@ def _slice_addresses(panels: Sequence[Panel], normal: str, index: int) -> list[s
 
 def _bars(panels: Sequence[Panel]) -> str:
     """Colour bars as HTML, one for all panels of the same range."""
-    shared: dict[tuple[Any, ...], list[str]] = {}
+    groups: dict[tuple[Any, ...], list[str]] = {}
     for panel in panels:
-        shared.setdefault((panel.limits, panel.unit, panel.colours), []).append(panel.title)
+        groups.setdefault((panel.limits, panel.unit, panel.colours), []).append(panel.title)
     bars = []
-    for ((low, high), unit, colours), titles in shared.items():
+    for ((low, high), unit, colours), titles in groups.items():
         text = " and ".join(titles)
         bars.append(
             f"<figure><figcaption>{escape(text)}{f' [{escape(unit)}]' if unit else ''}</figcaption>"

@@ -40,13 +40,13 @@ class RangeSlider:
             self._input = ui.element("input").classes("range")
             self._input.props(f'type=range min=0 max={max(last, 0)} step=1 value={value} aria-label="{escape(label)}"')
 
-        async def moved(event: Any) -> None:
+        async def move(event: Any) -> None:
             self.value = int(event.args)
             self._show()
             await on_change(self.value)
 
         event = "change" if on_release else "input"
-        self._input.on(event, moved, throttle=0.04, js_handler="(event) => emit(event.target.value)")
+        self._input.on(event, move, throttle=0.04, js_handler="(event) => emit(event.target.value)")
         self._show()
 
     def put(self, value: int) -> None:

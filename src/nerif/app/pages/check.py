@@ -43,7 +43,7 @@ class CheckPage:
                 with card("Do the views agree?", AGREE), ui.element("div").classes("form"):
                     name = draft.get("measurement")
                     self.choice = FileChoice("Measurement", measurements, name, work.measurements, self._on_choice)
-                    self.form = FormView(Form(self._record(), only=VIEW_SETTINGS), self._changed, draft.get("values"))
+                    self.form = FormView(Form(self._record(), only=VIEW_SETTINGS), self._on_change, draft.get("values"))
                     self.button = ui.button("Compare the views", icon="rule", on_click=self.compare)
                     self.button.props("unelevated no-caps")
                 with card("Is the rig as it was calibrated?", REFINE), ui.element("div").classes("form"):
@@ -79,7 +79,7 @@ class CheckPage:
         self.command.show(self.arguments)
         self.button.set_enabled(self.form.valid)
 
-    def _changed(self) -> None:
+    def _on_change(self) -> None:
         self._keep()
         self.show()
 
@@ -102,11 +102,11 @@ class CheckPage:
         with self.notice:
             bar = ui.linear_progress(0, show_value=False).props('aria-label="Comparing the views"')
         self.button.disable()
-        done = [0.0]
-        timer = ui.timer(0.3, lambda: bar.set_value(done[0]))
+        progress = [0.0]
+        timer = ui.timer(0.3, lambda: bar.set_value(progress[0]))
 
         def step(count: int, total: int) -> None:
-            done[0] = count / max(total, 1)
+            progress[0] = count / max(total, 1)
 
         messages: list[str] = []
         result = None

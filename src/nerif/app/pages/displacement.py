@@ -61,8 +61,8 @@ class DisplacementPage:
                     self.display = ui.element("div").props('aria-live="polite"')
             self._views()
         else:
-            lacking = "are no images of an experiment" if not contents.experiments else "is no calibration"
-            text_html(f"There {lacking} in the folder yet; the pages before this one help.", classes="status")
+            gap = "are no images of an experiment" if not contents.experiments else "is no calibration"
+            text_html(f"There {gap} in the folder yet; the pages before this one help.", classes="status")
         self.below = ui.element("div").classes("stack")
         self._show(contents.measurements)
 
@@ -160,7 +160,7 @@ class MeasurementCard:
         return self.choice.name
 
     def _read(self, name: str) -> Measurement:
-        return self.work.project.cached(name, "measurement", Measurement.read)
+        return self.work.project.from_cache(name, "measurement", Measurement.read)
 
     async def _on_choice(self) -> None:
         self.work.keep(PAGE.name, {**self.work.draft(PAGE.name), "measurement": self.name})

@@ -163,7 +163,7 @@ def _has_measurements(work: Workspace, name: str) -> bool:
             return False
 
     try:
-        return work.project.cached(f"{name}/zarr.json", "measured", read)
+        return work.project.from_cache(f"{name}/zarr.json", "measured", read)
     except FileNotFoundError:  # just being made, or none of ours
         return False
 

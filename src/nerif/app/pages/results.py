@@ -51,7 +51,7 @@ class ResultsPage:
         return next((row for row in self.rows if row.name == self.draft.get("result")), self.rows[0])
 
     def keep(self) -> None:
-        """Keep what is chosen over a reload."""
+        """Store the choices in the draft."""
         self.work.keep(PAGE.name, self.draft)
 
     async def choose(self, name: str) -> None:
@@ -60,7 +60,7 @@ class ResultsPage:
         await self.build()
 
     async def build(self) -> None:
-        """Build everything for the result that is chosen."""
+        """Build everything for the selected result."""
         self.keep()
         self.table.clear()
         self.place.clear()
@@ -103,7 +103,7 @@ class ResultsPage:
         async def on_change() -> None:
             self.draft["tab"] = panels.value
             self.keep()
-            if panels.value == "surface":  # of what is chosen in the slices
+            if panels.value == "surface":  # of the quantity in the slices
                 surface.clear()
                 with surface, refusals():
                     await view.surfaces()
@@ -132,7 +132,7 @@ class ResultsPage:
 
         def write() -> None:
             with refusals():
-                writing.follow(self.work.jobs.add(["report", name], f"Report {name}"))
+                status.follow(self.work.jobs.add(["report", name], f"Report {name}"))
 
         async def on_end(job: Job) -> None:
             if job.state == "done":
@@ -140,7 +140,7 @@ class ResultsPage:
 
         button = "Write it again" if file.is_file() else "Write the report"
         ui.button(button, icon="playlist_add", on_click=write).props("outline no-caps")
-        writing = JobStatus(self.work, f"{PAGE.name}.report {name}", on_end)
+        status = JobStatus(self.work, f"{PAGE.name}.report {name}", on_end)
 
     # -- for others ----------------------------------------------------------------------------------------------
 
@@ -158,7 +158,7 @@ class ResultsPage:
     def _free(self, ending: str) -> str:
         return self.work.project.free_name(f"exports/{PurePosixPath(self.row.name).stem}{ending}")
 
-    def _named(self, label: str, options: dict[str, str]) -> tuple[ui.select, ui.input]:
+    def _format_and_name(self, label: str, options: dict[str, str]) -> tuple[ui.select, ui.input]:
         """A choice of formats and the name of the file, which follows it."""
         first = next(iter(options))
         choice = select(label, options, first)
@@ -171,7 +171,7 @@ class ResultsPage:
         record = Export(tyro.MISSING, tyro.MISSING)
         form = Form(record, without=("config", "result", "out", "force"))
         with ui.element("div").classes("form"):
-            _, name = self._named("Format", {ending: PROGRAMS.get(ending, ending) for ending in FORMATS})
+            _, name = self._format_and_name("Format", {ending: PROGRAMS.get(ending, ending) for ending in FORMATS})
             job_form = JobForm(
                 self.work, f"{PAGE.name}.export", form, lambda: ["export", self.row.name, "-o", name.value or "FILE"],
                 "Export", ("voxels", "quantities"), lambda: name.value, about=self.row.name,
@@ -192,7 +192,7 @@ class ResultsPage:
         record = MovieCommand(tyro.MISSING, tyro.MISSING)
         form = Form(record, without=("config", "result", "out", "force"), choices={"style": STYLES})
         with ui.element("div").classes("form"):
-            _, name = self._named("Format", {".mp4": "H.264 (.mp4)", ".gif": "GIF (.gif)"})
+            _, name = self._format_and_name("Format", {".mp4": "H.264 (.mp4)", ".gif": "GIF (.gif)"})
             job_form = JobForm(
                 self.work, f"{PAGE.name}.movie", form, lambda: ["movie", self.row.name, "-o", name.value or "FILE"],
                 "Make the movie", ("style", "every"), lambda: name.value, about=self.row.name,
