@@ -13,8 +13,8 @@ from nerif.app.jobs import command_line
 from nerif.common.conventions import InputError
 
 __all__ = [
-    "CommandLine", "FileChoice", "card", "dialog", "figures", "items_html", "refusals", "select", "table_html",
-    "text_html",
+    "CommandLine", "FileChoice", "card", "dialog", "figures", "images_html", "items_html", "refusals", "select",
+    "table_html", "text_html", "work_in_progress",
 ]  # fmt: skip
 
 
@@ -53,6 +53,27 @@ def table_html(label: str, head: Sequence[str], rows: Mapping[str, Sequence[str]
     titles = "".join(f"<th scope=col>{escape(title)}</th>" for title in head)
     table = f"<table><thead><tr>{titles}</tr></thead><tbody>{''.join(lines)}</tbody></table>"
     return f'<div class=tabled tabindex=0 role=region aria-label="{escape(label)}">{table}</div>'
+
+
+def images_html(images: Sequence[tuple[str, str, str]]) -> str:
+    """Return a row of images as HTML: address, text for screen readers, caption."""
+    figures = (
+        f'<figure><img src="{address}" alt="{escape(text)}"><figcaption>{escape(caption)}</figcaption></figure>'
+        for address, text, caption in images
+    )
+    return f"<div class=images>{''.join(figures)}</div>"
+
+
+@contextmanager
+def work_in_progress(button: ui.button, place: ui.element) -> Iterator[None]:
+    """Disable a button and fill an element, which shows the progress, until the end of the block."""
+    button.disable()
+    place.clear()
+    try:
+        yield
+    finally:
+        button.enable()
+        place.clear()
 
 
 @contextmanager

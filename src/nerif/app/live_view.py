@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from nicegui import ui
 
-from nerif.app.elements import refusals, select
+from nerif.app.elements import images_html, refusals, select
 from nerif.app.jobs import Job
 from nerif.app.result_volumes import film_progress
 from nerif.app.surfaces import LiveSurface, caption_of
@@ -171,7 +171,7 @@ def curve_options(curve: dict[str, list[float | None]]) -> dict[str, Any]:
 
 def look_html(look: Look) -> str:
     """Return the images of a look as HTML: measured and predicted view, three central slices."""
-    figures = []
+    images = []
     unit = unit_shown(look.unit)
     for c, component in enumerate(look.components):
         measured, predicted = look.measured[..., c], look.predicted[..., c]
@@ -183,15 +183,11 @@ def look_html(look: Look) -> str:
         for kind, image in (("measured", measured), ("predicted", np.where(valid, predicted, np.nan))):
             residual = "" if kind == "measured" else f"; rms residual {rms:.2g} {unit}"
             text = f"{look.view} ({use}), {component} {kind}; {ends}{residual}"
-            figures.append((image_address(image, limits), text))
+            images.append((image_address(image, limits), text, text))
     z, y, x = (n // 2 for n in look.values.shape)
     limits = colour_range(look.values)
     for normal, image in (("z", look.values[z]), ("y", look.values[:, y]), ("x", look.values[:, :, x])):
         middle = (look.lower["xyz".index(normal)] + look.upper["xyz".index(normal)]) / 2
         text = f"{name_of(look.quantity)} at {normal} = {middle:g} mm; {limits[0]:.2g} to {limits[1]:.2g}"
-        figures.append((image_address(image[::-1], limits), text))
-    inside = "".join(
-        f'<figure><img src="{address}" alt="{escape(text)}"><figcaption>{escape(text)}</figcaption></figure>'
-        for address, text in figures
-    )
-    return f"<div class=images>{inside}</div><p class=note>After {look.seconds:.0f} s, {escape(look.title)}.</p>"
+        images.append((image_address(image[::-1], limits), text, text))
+    return f"{images_html(images)}<p class=note>After {look.seconds:.0f} s, {escape(look.title)}.</p>"

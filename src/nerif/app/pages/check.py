@@ -8,7 +8,16 @@ from dataclasses import replace
 from nicegui import ui
 
 from nerif.analysis.consistency import Consistency, check_consistency
-from nerif.app.elements import CommandLine, FileChoice, card, items_html, refusals, table_html, text_html
+from nerif.app.elements import (
+    CommandLine,
+    FileChoice,
+    card,
+    items_html,
+    refusals,
+    table_html,
+    text_html,
+    work_in_progress,
+)
 from nerif.app.form_view import FormView
 from nerif.app.forms import Form
 from nerif.app.frame import Page
@@ -98,29 +107,22 @@ class CheckPage:
     async def compare(self) -> None:
         """Compare the views and show the findings."""
         name, arguments = self.choice.name, self.arguments
-        self.notice.clear()
-        with self.notice:
-            bar = ui.linear_progress(0, show_value=False).props('aria-label="Comparing the views"')
-        self.button.disable()
         progress = [0.0]
-        timer = ui.timer(0.3, lambda: bar.set_value(progress[0]))
 
         def step(count: int, total: int) -> None:
             progress[0] = count / max(total, 1)
 
+        def work(settings: Check) -> Consistency:
+            measurement = Measurement.read(self.work.project.path(name))
+            return check_consistency(measurement, settings.voxels, step, settings.aperture)
+
         messages: list[str] = []
         result = None
-        with refusals(messages.append):
-            request = self.form.record()
-
-            def work() -> Consistency:
-                measurement = Measurement.read(self.work.project.path(name))
-                return check_consistency(measurement, request.voxels, step, request.aperture)
-
-            result = await self.work.in_thread(work)
-        timer.cancel()
-        self.button.enable()
-        self.notice.clear()
+        with work_in_progress(self.button, self.notice), refusals(messages.append):
+            with self.notice:
+                bar = ui.linear_progress(0, show_value=False).props('aria-label="Comparing the views"')
+                ui.timer(0.3, lambda: bar.set_value(progress[0]))
+            result = await self.work.in_thread(work, self.form.record())
         with self.notice:
             for text in messages:
                 text_html(text, classes="status")

@@ -9,7 +9,7 @@ from typing import Any
 
 from nicegui import ui
 
-from nerif.app.elements import FileChoice, card, refusals, select, text_html
+from nerif.app.elements import FileChoice, card, refusals, select, text_html, work_in_progress
 from nerif.app.forms import Form
 from nerif.app.frame import Page
 from nerif.app.job_form import JobForm
@@ -98,13 +98,11 @@ class DisplacementPage:
 
     async def preview(self) -> None:
         """Find the displacements of one view and show them."""
-        self.button.disable()
-        self.display.clear()
-        with self.display:
-            ui.spinner(size="lg").props('aria-label="Working"')
         lines: list[str] = []
         html = ""
-        with refusals(lines.append):
+        with work_in_progress(self.button, self.display), refusals(lines.append):
+            with self.display:
+                ui.spinner(size="lg").props('aria-label="Working"')
             request = replace(
                 self.job.view.record(), folder=self.work.project.path(str(self.experiment.value)),
                 calibration=self.work.project.path(str(self.calibration.value)), views=(str(self.view.value),),
@@ -117,8 +115,6 @@ class DisplacementPage:
                 return maps_html(measurement)
 
             html = await self.work.in_thread(work)
-        self.button.enable()
-        self.display.clear()
         with self.display:
             for text in lines:
                 text_html(text, classes="status")

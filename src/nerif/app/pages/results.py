@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import PurePosixPath
 from typing import Any
 
@@ -155,28 +155,30 @@ class ResultsPage:
             with card("Figures for print", "Vector PDF and PNG, as wide as the columns of a journal."):
                 self._figures()
 
-    def _free(self, ending: str) -> str:
-        return self.work.project.free_name(f"exports/{PurePosixPath(self.row.name).stem}{ending}")
+    def _file_form(
+        self, verb: str, form: Form[Any], formats: Mapping[str, str], button: str, main: Sequence[str]
+    ) -> None:
+        """Build the form of a command that writes a file, with a choice of its format that changes its name."""
 
-    def _format_and_name(self, label: str, options: dict[str, str]) -> tuple[ui.select, ui.input]:
-        """A choice of formats and the name of the file, which follows it."""
-        first = next(iter(options))
-        choice = select(label, options, first)
-        name = ui.input("File to write", value=self._free(first)).props("outlined dense debounce=250")
-        name.props["aria-label"] = "File to write"
-        choice.on_value_change(lambda: name.set_value(self._free(choice.value)))
-        return choice, name
+        def name_with(ending: str) -> str:
+            return self.work.project.free_name(f"exports/{PurePosixPath(self.row.name).stem}{ending}")
+
+        first = next(iter(formats))
+        with ui.element("div").classes("form"):
+            choice = select("Format", dict(formats), first)
+            name = ui.input("File to write", value=name_with(first)).props("outlined dense debounce=250")
+            name.props["aria-label"] = "File to write"
+            job_form = JobForm(
+                self.work, f"{PAGE.name}.{verb}", form, lambda: [verb, self.row.name, "-o", name.value or "FILE"],
+                button, main, lambda: name.value, about=self.row.name,
+            )  # fmt: skip
+        choice.on_value_change(lambda: name.set_value(name_with(choice.value)))
+        name.on_value_change(job_form.show)
 
     def _volume(self) -> None:
-        record = Export(tyro.MISSING, tyro.MISSING)
-        form = Form(record, without=("config", "result", "out", "force"))
-        with ui.element("div").classes("form"):
-            _, name = self._format_and_name("Format", {ending: PROGRAMS.get(ending, ending) for ending in FORMATS})
-            job_form = JobForm(
-                self.work, f"{PAGE.name}.export", form, lambda: ["export", self.row.name, "-o", name.value or "FILE"],
-                "Export", ("voxels", "quantities"), lambda: name.value, about=self.row.name,
-            )  # fmt: skip
-        name.on_value_change(job_form.show)
+        form = Form(Export(tyro.MISSING, tyro.MISSING), without=("config", "result", "out", "force"))
+        formats = {ending: PROGRAMS.get(ending, ending) for ending in FORMATS}
+        self._file_form("export", form, formats, "Export", ("voxels", "quantities"))
 
     def _figures(self) -> None:
         record = Figures(tyro.MISSING)
@@ -191,13 +193,8 @@ class ResultsPage:
     def _movie(self) -> None:
         record = MovieCommand(tyro.MISSING, tyro.MISSING)
         form = Form(record, without=("config", "result", "out", "force"), choices={"style": STYLES})
-        with ui.element("div").classes("form"):
-            _, name = self._format_and_name("Format", {".mp4": "H.264 (.mp4)", ".gif": "GIF (.gif)"})
-            job_form = JobForm(
-                self.work, f"{PAGE.name}.movie", form, lambda: ["movie", self.row.name, "-o", name.value or "FILE"],
-                "Make the movie", ("style", "every"), lambda: name.value, about=self.row.name,
-            )  # fmt: skip
-        name.on_value_change(job_form.show)
+        formats = {".mp4": "H.264 (.mp4)", ".gif": "GIF (.gif)"}
+        self._file_form("movie", form, formats, "Make the movie", ("style", "every"))
 
 
 async def build(work: Workspace) -> None:
