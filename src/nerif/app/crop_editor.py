@@ -66,22 +66,21 @@ class CropCard:
         self._first: dict[str, int] = {}
         self._editor: CropEditor | None = None
         self._place = ui.element("div").classes("crop-card")
-        self.selection = ""
-        self.load("", {}, {})
+        self.load("", {}, {}, "")
 
-    def load(self, experiment: str, views: Mapping[str, View], draft: Mapping[str, Any]) -> None:
-        """Take the views of an experiment, and select the first one unless the selected one is among them.
+    def load(self, experiment: str, views: Mapping[str, View], draft: Mapping[str, Any], selection: str) -> None:
+        """Take the views of an experiment; `show` shows the selected one.
 
         Parameters
         ----------
         experiment : folder, relative to the project
         views : its views by name
         draft : draft of the edits
+        selection : name of a view; another name selects the first
         """
         self.experiment, self.views = experiment, views
         self.edits = Edits({name: view.crop or Crop() for name, view in views.items()}, lambda c: Crop(**c), draft)
-        if self.selection not in views:
-            self.selection = next(iter(views), "")
+        self.selection = selection if selection in views else next(iter(views), "")
 
     async def show(self) -> None:
         """Show the selected view."""

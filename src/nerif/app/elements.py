@@ -85,8 +85,9 @@ def dialog(classes: str = "") -> Iterator[None]:
 
 
 def select(label: str, options: Any, value: Any = None) -> ui.select:
-    """Build a choice between options: a list, or texts by their values."""
-    control = ui.select(options, label=label, value=value).props("outlined dense options-dense")
+    """Build a choice between options, a list or texts by their values; another value selects the first."""
+    first = value if value in list(options) else next(iter(options), None)
+    control = ui.select(options, label=label, value=first).props("outlined dense options-dense")
     control.props["aria-label"] = label
     return control
 
@@ -107,7 +108,7 @@ class FileChoice:
         self, label: str, names: Sequence[str], value: object, look_up: Callable[[], Awaitable[Sequence[str]]],
         on_change: Callable[[], Awaitable[None] | None],
     ) -> None:  # fmt: skip
-        self.select = select(label, list(names), str(value) if value in names else next(iter(names), None))
+        self.select = select(label, list(names), value)
         self._look_up = look_up
         self.select.on("popup-show", self._refresh)
         self.select.on_value_change(on_change)

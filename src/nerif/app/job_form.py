@@ -33,23 +33,23 @@ class JobForm:
     button : label of the button
     main : names of the fields at the top of the form
     out : returns the output, relative to the project; its folder is created
-    first : called before the run is queued; an InputError prevents the run
-    about : subject of the run, part of the key that restores its status after a reload
-    offer : called by a button that continues with the output; None for no button
+    before : called before the run is queued; an InputError prevents the run
+    subject : subject of the run, part of the key that restores its status after a reload
+    on_continue : called by a button that continues with the output; None for no button
     lines : number of log lines shown after success
     """
 
     def __init__(
         self, work: Workspace, name: str, form: Form[Any], words: Callable[[], Sequence[str]], button: str,
         main: Sequence[str] = (), out: Callable[[], str] | None = None,
-        first: Callable[[], Awaitable[None]] | None = None, about: str = "",
-        offer: Callable[[str], Awaitable[None]] | None = None, lines: int = LINES,
+        before: Callable[[], Awaitable[None]] | None = None, subject: str = "",
+        on_continue: Callable[[str], Awaitable[None]] | None = None, lines: int = LINES,
     ) -> None:  # fmt: skip
-        self.work, self.name, self.words, self.out, self.first = work, name, words, out, first
+        self.work, self.name, self.words, self.out, self.before = work, name, words, out, before
         self.view = FormView(form, self._on_change, work.draft(name), main)
         self.command = CommandLine()
         self.button = ui.button(button, icon="playlist_add", on_click=self._start).props("unelevated no-caps")
-        self.status = JobStatus(work, f"{name}.run {about}".strip(), offer=offer, lines=lines)
+        self.status = JobStatus(work, f"{name}.run {subject}".strip(), on_continue=on_continue, lines=lines)
         self.show()
 
     @property
@@ -70,8 +70,8 @@ class JobForm:
     async def _start(self) -> None:
         with refusals():
             self.view.record()
-            if self.first is not None:
-                await self.first()
+            if self.before is not None:
+                await self.before()
             if self.out is not None:
                 self.work.project.path(self.out()).parent.mkdir(parents=True, exist_ok=True)
             words = self.arguments
@@ -86,16 +86,16 @@ class JobStatus:
     work : workspace of the project
     name : key of the draft with the id of the run
     on_end : called when the run has ended
-    offer : called by a button that continues with the output; None for no button
+    on_continue : called by a button that continues with the output; None for no button
     lines : number of log lines shown after success
     """
 
     def __init__(
         self, work: Workspace, name: str, on_end: Callable[[Job], Awaitable[None]] | None = None,
-        offer: Callable[[str], Awaitable[None]] | None = None, lines: int = LINES,
+        on_continue: Callable[[str], Awaitable[None]] | None = None, lines: int = LINES,
     ) -> None:  # fmt: skip
         self.work, self.name, self.job = work, name, str(work.draft(name).get("job", ""))
-        self._on_end, self._offer, self._lines = on_end, offer, {"done": lines, "failed": 30}
+        self._on_end, self._on_continue, self._lines = on_end, on_continue, {"done": lines, "failed": 30}
         self._content: tuple[str, ...] = ()
         self.place = ui.element("div").props("role=status aria-live=polite")
         self.further = ui.element("div")
@@ -143,13 +143,13 @@ class JobStatus:
             return
         self._show(ENDS[job.state], lines)
         self._forget()
-        if self._offer is not None and job.state == "done" and job.file:
-            self._go_on(self._offer, self.work.project.relative(job.file))
+        if self._on_continue is not None and job.state == "done" and job.file:
+            self._go_on(self._on_continue, self.work.project.relative(job.file))
         if self._on_end is not None:
             await self._on_end(job)
 
-    def _go_on(self, offer: Callable[[str], Awaitable[None]], file: str) -> None:
+    def _go_on(self, on_continue: Callable[[str], Awaitable[None]], file: str) -> None:
         self.further.clear()
         with self.further:
-            button = ui.button(f"Go on with {file}", icon="arrow_forward", on_click=lambda: offer(file))
+            button = ui.button(f"Go on with {file}", icon="arrow_forward", on_click=lambda: on_continue(file))
             button.props("unelevated no-caps")

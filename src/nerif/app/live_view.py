@@ -52,7 +52,7 @@ class LiveView:
                 }
             self.chart = ui.echart(curve_options({})).classes("curve").style("height: 260px; width: 100%")
             self.surface = LiveSurface()
-            self.look = ui.html("", sanitize=False)
+            self.images = ui.html("", sanitize=False)
         self.chart.set_visibility(False)
         ui.timer(EVERY, self._refresh)
 
@@ -60,7 +60,7 @@ class LiveView:
         """Show this run."""
         if id and id != self.job:
             self.job, self._cache = id, {}
-            self.look.set_content("")
+            self.images.set_content("")
             self.surface.clear()
 
     async def _do(self, action: str) -> None:
@@ -103,7 +103,7 @@ class LiveView:
             self.chart.options.update(curve_options(live["curve"]))
         if news is not None:
             images, box, caption = news
-            self.look.set_content(images)
+            self.images.set_content(images)
             if caption:
                 self.surface.show(job.out, cache[LIVE_FIELD], box, caption)
 

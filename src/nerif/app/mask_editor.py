@@ -45,12 +45,13 @@ class MaskCard:
     page : name of the page whose draft stores the shapes
     name : measurement file, relative to the project
     measurement : Measurement
-    offer : called with the file of the masked measurement
+    on_continue : called with the file of the masked measurement
     """
 
     def __init__(
-        self, work: Workspace, page: str, name: str, measurement: Measurement, offer: Callable[[str], Awaitable[None]]
-    ) -> None:
+        self, work: Workspace, page: str, name: str, measurement: Measurement,
+        on_continue: Callable[[str], Awaitable[None]],
+    ) -> None:  # fmt: skip
         self.work, self.page, self.name, self.measurement = work, page, name, measurement
         original: dict[str, Shapes] = dict.fromkeys(measurement.names, ())
         self.edits = Edits(original, _shapes, work.draft(page).get("masks", {}).get(name))
@@ -66,8 +67,8 @@ class MaskCard:
         self._lock = asyncio.Lock()
         form = Form(record, only=SETTINGS)
         self.job = JobForm(
-            work, f"{page}.mask", form, self._words, "Apply the masks", SETTINGS[:1], first=self._write, about=name,
-            offer=offer,
+            work, f"{page}.mask", form, self._words, "Apply the masks", SETTINGS[:1], before=self._write, subject=name,
+            on_continue=on_continue,
         )  # fmt: skip
         self.view.on_value_change(self._build_editor)
         self._build_editor()

@@ -64,13 +64,11 @@ class ResultView:
             text_html(f"{self.name}: it contains no field.", classes="note")
             return
         self.readable = True
-        quantity = str(self.draft.get("quantity", ""))
         options = {q: describe(q)[1].capitalize() for q in quantities}
         with ui.element("div").classes("choices"):
-            self.quantity = select("Quantity", options, quantity if quantity in options else quantities[0])
-            against = str(self.draft.get("against", ""))
+            self.quantity = select("Quantity", options, self.draft.get("quantity"))
             choices = {"": "Nothing", **{name: name for name in self.others}}
-            self.against = select("Compare with", choices, against if against in choices else "")
+            self.against = select("Compare with", choices, self.draft.get("against"))
             self.spread = ui.switch("Standard deviation", value=bool(self.draft.get("spread")))
         for control in (self.quantity, self.against, self.spread):
             control.on_value_change(self._update_draft)

@@ -64,13 +64,11 @@ class CalibrationPage:
         self.request = 0  # number of the last drawing of the rig
         self._display: tuple[Any, ...] = ()  # `_display_key` of the images on the page
         experiments = list(contents.experiments)
-        name = draft.get("experiment")
         with ui.element("div").classes("columns"):
             with card("Calibrate"), ui.element("div").classes("form"):
                 if not experiments:
                     text_html("There are no images in this folder yet; the page Images says where they go.")
-                first = name if name in experiments else next(iter(experiments), None)
-                self.experiment = select("Experiment", experiments, first).classes("short")
+                self.experiment = select("Experiment", experiments, draft.get("experiment")).classes("short")
                 self.way = select("From", WAYS, bool(draft.get("simple", False))).classes("short")
                 self.out = ui.input("Calibration to write", value=str(draft.get("out", "calibration.toml")))
                 self.out.props("outlined dense debounce=250").props["aria-label"] = "Calibration to write"
@@ -84,7 +82,7 @@ class CalibrationPage:
                     self.command = CommandLine()
                     self.status = JobStatus(work, f"{PAGE.name}.run", self._on_end)
                 with card("The rig"):
-                    self.calibration = select("Calibration", list(contents.calibrations)).classes("short")
+                    self.calibration = select("Calibration", []).classes("short")
                     self.rig = ui.element("div").classes("rig")
                 with card("Images of the target", "Circles: detected points, the first one filled. "
                           "Left-out images are part of the command line; calibrate again after it."):  # fmt: skip

@@ -69,7 +69,7 @@ class CheckPage:
                     with self.notice:
                         text_html("The views have not been compared yet.", classes="status")
                 with card("Undone") as self.correction:
-                    self.correction_status = JobStatus(work, f"{PAGE.name}.undone", offer=self.choice.choose)
+                    self.correction_status = JobStatus(work, f"{PAGE.name}.undone", on_continue=self.choice.choose)
         self.correction.set_visibility(bool(self.correction_status.job))
         self.show()
 

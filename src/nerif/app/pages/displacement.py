@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from nicegui import ui
 
@@ -42,15 +41,16 @@ class DisplacementPage:
         if contents.experiments and contents.calibrations:
             with ui.element("div").classes("columns"):
                 with card("Images to displacements"), ui.element("div").classes("form"):
-                    self.experiment = _select("Experiment", contents.experiments, draft)
-                    self.calibration = _select("Calibration", contents.calibrations, draft)
+                    self.experiment = select("Experiment", list(contents.experiments), draft.get("experiment"))
+                    calibrations = list(contents.calibrations)
+                    self.calibration = select("Calibration", calibrations, draft.get("calibration"))
                     self.out = ui.input("Measurement to write", value=work.project.free_name("measurement.nc"))
                     self.out.props('outlined dense aria-label="Measurement to write"')
                     record = Displacement(Path("."), Path("."), Path("measurement.nc"))
                     form = Form(record, without=BY_PAGE)
                     self.job = JobForm(
                         work, f"{PAGE.name}.run", form, self._words, "Find all displacements", MAIN,
-                        lambda: str(self.out.value), offer=self._go_on,
+                        lambda: str(self.out.value), on_continue=self._on_continue,
                     )  # fmt: skip
                     for control in (self.experiment, self.calibration, self.out):
                         control.on_value_change(self._on_choice)
@@ -71,7 +71,7 @@ class DisplacementPage:
             with self.below:
                 self.measurement_card = MeasurementCard(self.work, measurements)
 
-    async def _go_on(self, file: str) -> None:
+    async def _on_continue(self, file: str) -> None:
         """Show a measurement that a run has written, and give the next one a new name."""
         self._show(await self.work.measurements())
         if self.measurement_card is not None:
@@ -119,12 +119,6 @@ class DisplacementPage:
             for text in lines:
                 text_html(text, classes="status")
             ui.html(html, sanitize=False)
-
-
-def _select(label: str, names: Sequence[str], draft: Mapping[str, Any]) -> ui.select:
-    """Build a choice of a file, by default the one in the draft."""
-    name = draft.get(label.lower())
-    return select(label, list(names), name if name in names else names[0])
 
 
 class MeasurementCard:

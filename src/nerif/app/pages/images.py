@@ -28,36 +28,34 @@ class ImagesPage:
 
     def __init__(self, work: Workspace, experiments: Sequence[str]) -> None:
         self.work, draft = work, work.draft(PAGE.name)
-        name = str(draft.get("experiment", ""))
-        self.experiment = name if name in experiments else experiments[0]
         self.drafts: dict[str, Any] = dict(draft.get("edits", {}))  # of the crops, by experiment
         self.views: dict[str, View] = {}
         self._request = 0
         with ui.element("div").classes("stack"):
             with card("Folder of images"):
-                choice = select("Experiment", list(experiments), self.experiment).classes("short")
+                choice = select("Experiment", list(experiments), draft.get("experiment")).classes("short")
                 self.summary = ui.element("div")
                 text_html("The next step on the command line", "h3")
                 self.command = CommandLine()
             with card("Views", "The first good image of each, its grey values, and what cannot be used."):
                 self.grid = ui.element("div").classes("views")
             self.crop = CropCard(work, self._keep, self._on_save)
-        self.crop.selection = str(draft.get("view", ""))
+        self.experiment = str(choice.value)
 
         async def on_change() -> None:
-            self.experiment, self.crop.selection = choice.value, ""
+            self.experiment = str(choice.value)
             await self.build()
 
         choice.on_value_change(on_change)
 
-    async def build(self) -> None:
-        """Build everything for the selected experiment; images come one after the other."""
+    async def build(self, view: str = "") -> None:
+        """Build everything for the selected experiment, with a view in large; images come one after the other."""
         self._request += 1
         request = self._request
         with refusals():
             views = await self.work.in_thread(self.work.project.views, self.experiment)
             self.views = {view.name: view for view in views}
-        self.crop.load(self.experiment, self.views, self.drafts.get(self.experiment, {}))
+        self.crop.load(self.experiment, self.views, self.drafts.get(self.experiment, {}), view)
         self._keep()
         out = self.work.project.free_name("measurement.nc")
         self.command.show(["displacement", self.experiment, "--calibration", "calibration.toml", "-o", out])
@@ -66,8 +64,8 @@ class ImagesPage:
             self.cells = {name: ui.element("article").classes("view") for name in self.views}
         problems: list[str] = []
         await self.crop.show()
-        for view in list(self.views.values()):
-            problems += await self._cell(view, request)
+        for one in list(self.views.values()):
+            problems += await self._cell(one, request)
             if request != self._request:  # another experiment has been selected meanwhile
                 return
             self._show_summary(problems)
@@ -75,13 +73,13 @@ class ImagesPage:
 
     def _keep(self) -> None:
         """Store selection and edits in the draft."""
-        self.drafts[self.experiment] = self.crop.edits.draft
-        draft = {"experiment": self.experiment, "view": self.crop.selection, "edits": self.drafts}
+        self.drafts[self.crop.experiment] = self.crop.edits.draft
+        draft = {"experiment": self.crop.experiment, "view": self.crop.selection, "edits": self.drafts}
         self.work.keep(PAGE.name, draft)
 
     async def _on_save(self) -> None:
-        self.drafts[self.experiment] = {**self.crop.edits.draft, "now": {}}
-        await self.build()
+        self.drafts[self.crop.experiment] = {**self.crop.edits.draft, "now": {}}
+        await self.build(self.crop.selection)
 
     def _show_summary(self, problems: Sequence[str]) -> None:
         self.summary.clear()
@@ -178,9 +176,9 @@ async def build(work: Workspace) -> None:
         with card("In this folder"):
             text_html("There are no images in this folder yet. " + LAYOUT, classes="note")
         return
-    page = ImagesPage(work, experiments)
+    page, view = ImagesPage(work, experiments), str(work.draft(PAGE.name).get("view", ""))
     with ui.element("div"):
-        ui.timer(0.01, page.build, once=True)  # the page is there before its images are read
+        ui.timer(0.01, lambda: page.build(view), once=True)  # the page is there before its images are read
 
 
 ABOUT = "What is in the folder, whether it can be used, and which part of the frames is each view's own."

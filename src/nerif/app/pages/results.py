@@ -170,7 +170,7 @@ class ResultsPage:
             name.props["aria-label"] = "File to write"
             job_form = JobForm(
                 self.work, f"{PAGE.name}.{verb}", form, lambda: [verb, self.row.name, "-o", name.value or "FILE"],
-                button, main, lambda: name.value, about=self.row.name,
+                button, main, lambda: name.value, subject=self.row.name,
             )  # fmt: skip
         choice.on_value_change(lambda: name.set_value(name_with(choice.value)))
         name.on_value_change(job_form.show)
@@ -187,7 +187,7 @@ class ResultsPage:
             text_html(f"They are written to {self.row.name}/figures.", classes="note")
             JobForm(
                 self.work, f"{PAGE.name}.figures", form, lambda: ["figures", self.row.name], "Draw the figures",
-                about=self.row.name,
+                subject=self.row.name,
             )  # fmt: skip
 
     def _movie(self) -> None:
