@@ -18,7 +18,8 @@ from app.test_calibration import TARGET
 from app.test_live_view import watched
 from app.test_pages import visit
 from app.test_results import result
-from nerif.app.pages import PAGES, Page
+from nerif.app.frame import Page
+from nerif.app.pages import PAGES
 from nerif.geometry import Ring
 from nerif.imaging.calibration.cameras_file import CalibratedCamera, write_cameras
 from nerif.simulation.simulate import Simulation

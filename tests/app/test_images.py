@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from app.serving import Served, opened
-from nerif.app.crop_edits import CropEdits
+from nerif.app.edits import Edits
 from nerif.app.image_files import ImageFiles
 from nerif.app.project import Project
 from nerif.imaging.readers.crop import Crop
@@ -40,19 +40,23 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_steps_are_undone_and_kept():
     one, other = Crop(row=2), Crop(row=2, flip="both")
-    edits = CropEdits({"a": Crop(), "b": Crop()})
+
+    def read(entries: dict[str, Any]) -> Crop:
+        return Crop(**entries)
+
+    edits = Edits({"a": Crop(), "b": Crop()}, read)
     edits.put("a", one)
     edits.put("a", other)
     edits.put("b", one)
     assert edits.undo() == "b"
     assert edits.undo() == "a"
     assert edits.now == {"a": one, "b": Crop()}
-    again = CropEdits({"a": Crop(), "b": Crop()}, edits.draft)
+    again = Edits({"a": Crop(), "b": Crop()}, read, edits.draft)
     assert again.redo() == "a"
-    assert again.changed == {"a": other}
+    assert again.changes == {"a": other}
     again.put("b", other)
     assert again.redo() == ""
-    assert CropEdits({"b": Crop()}, edits.draft).undo() == ""  # its view has gone
+    assert Edits({"b": Crop()}, read, edits.draft).undo() == ""  # its view has gone
 
 
 def visit(driver: Any, server: Served) -> None:
@@ -68,7 +72,7 @@ def value(driver: Any, name: str) -> str:
 
 def click(driver: Any, label: str) -> None:
     """Click a button of the view that is shown large."""
-    driver.find_element("xpath", f"//*[contains(@class, 'closer')]//button[contains(., '{label}')]").click()
+    driver.find_element("xpath", f"//*[contains(@class, 'crop-card')]//button[contains(., '{label}')]").click()
 
 
 @needs_browser
@@ -127,16 +131,17 @@ def test_a_crop_is_drawn_undone_typed_kept_and_written(browser, server, folder):
     box = browser.find_element("css selector", "input[name=width]")
     box.send_keys(Keys.CONTROL, "a")
     box.send_keys("900")
-    wait_for(browser, "return document.querySelector('.closer .error span') !== null")
-    assert "Expected a crop within its 48 x 64 px" in text(browser, ".closer .error span")
+    wait_for(browser, "return document.querySelector('.crop-card .error span') !== null")
+    assert "Expected a crop within its 48 x 64 px" in text(browser, ".crop-card .error span")
     box.send_keys(Keys.CONTROL, "a")
     box.send_keys("20")
-    wait_for(browser, "return document.querySelector('.closer .error span') === null")
+    wait_for(browser, "return document.querySelector('.crop-card .error span') === null")
     assert not (folder / "run" / "views.toml").exists()
     visit(browser, server)  # a reload loses nothing
     assert value(browser, "width") == "20"
     click(browser, "Save to views.toml")
-    wait_for(browser, "return document.querySelector('.closer p[role=status]')?.textContent.startsWith('The commands')")
+    saved = "document.querySelector('.crop-card p[role=status]')?.textContent.startsWith('The commands')"
+    wait_for(browser, f"return {saved}")
     crops = {view.name: view.crop for view in find_views(folder / "run")}
     assert crops["cam1"] == Crop(row=12, column=16, height=12, width=20)
     assert crops["cam <2>"] is None
@@ -146,7 +151,7 @@ def test_a_crop_is_drawn_undone_typed_kept_and_written(browser, server, folder):
 def test_images_are_kept_until_their_files_change(folder, monkeypatch):
     files = ImageFiles(Project(folder))
     view = next(v for v in find_views(folder / "run") if v.name == "cam1")
-    monkeypatch.setattr("nerif.app.image_files.MOST", 2)
+    monkeypatch.setattr("nerif.app.image_files.LIMIT", 2)
     first = files.image(view, "flow", 0, 280, None)
     assert files.image(view, "flow", 0, 280, None) is first
     files.image(view, "flow", 1, 280, None)
@@ -162,8 +167,8 @@ def test_the_view_that_is_chosen_last_is_the_one_shown_large(browser, server):
     visit(browser, server)
     script = "document.querySelectorAll('.view button').forEach(b => b.click())"
     browser.execute_script(script)
-    wait_for(browser, "return document.querySelector('.closer h2')?.textContent === 'cam3'")
-    wait_for(browser, "return document.querySelectorAll('.closer .cropper').length === 1")
+    wait_for(browser, "return document.querySelector('.crop-card h2')?.textContent === 'cam3'")
+    wait_for(browser, "return document.querySelectorAll('.crop-card .cropper').length === 1")
     box = browser.execute_script("return document.querySelector('.cropper').getBoundingClientRect().toJSON()")
     assert box["width"] / box["height"] == pytest.approx(WIDTH / HEIGHT, rel=0.02)
     assert errors(browser) == []

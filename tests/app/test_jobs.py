@@ -14,7 +14,7 @@ import pytest
 
 from nerif.app import runner
 from nerif.app.jobs import Job, Jobs, claim, command_line
-from nerif.app.jobs_drawer import film_progress
+from nerif.app.result_volumes import film_progress
 from nerif.cli.cli import main
 from nerif.common.files import write_json
 from refusals import refused

@@ -12,8 +12,8 @@ import pytest
 
 from app.serving import opened
 from nerif.app.jobs import Jobs
-from nerif.app.live_surface import caption_of
 from nerif.app.live_view import status_html
+from nerif.app.surfaces import caption_of
 from nerif.common.files import write_json
 from nerif.results.directory import LIVE, LIVE_FIELD
 from nerif.results.live import read_look

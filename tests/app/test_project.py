@@ -79,9 +79,9 @@ def test_what_is_kept_of_a_file_is_as_new_as_the_file(folder):
         calls.append(p)
         return p.read_text()
 
-    assert [project.cached("a", "text", read) for _ in range(3)] == ["1"] * 3
+    assert [project.from_cache("a", "text", read) for _ in range(3)] == ["1"] * 3
     path.write_text("22")
-    assert project.cached("a", "text", read) == "22"
+    assert project.from_cache("a", "text", read) == "22"
     assert len(calls) == 2
 
 

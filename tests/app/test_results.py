@@ -15,9 +15,9 @@ from app.serving import Served, opened
 from app.test_pages import line
 from nerif.app.jobs import Jobs
 from nerif.app.project import Project
-from nerif.app.result_look import ResultLook
 from nerif.app.result_table import rows_of
-from nerif.app.sources import Film, Still
+from nerif.app.result_view import ResultView
+from nerif.app.result_volumes import Film, Still
 from nerif.data.exports import export
 from nerif.data.volume import Volume
 from nerif.data.volume_file import read_volumes
@@ -109,7 +109,7 @@ def test_films_are_compared_at_the_same_instants(tmp_path):
         store = VolumeSequence.create(tmp_path / f"{name}.zarr", times, grid, ("index_excess",), AMBIENT)
         for i, time in enumerate(times):
             store.write(i, [Volume(torch.full(grid.shape, time), grid)])
-    look = ResultLook(SimpleNamespace(project=Project(tmp_path)), "a.zarr", ["b.zarr"], {}, lambda: None)
+    look = ResultView(SimpleNamespace(project=Project(tmp_path)), "a.zarr", ["b.zarr"], {}, lambda: None)
     look.source = Film(tmp_path / "a.zarr")
     for step, time in ((1, 1e-3), (2, 2.4e-3)):
         panels, note = look._panels("index_excess", "b.zarr", step)

@@ -42,6 +42,7 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, A
 
 def go(driver: Any, title: str) -> None:
     """Follow the navigation to a page."""
+    wait_for(driver, "return document.querySelector('nav a') !== null")  # the first page reloads without its token
     driver.find_element("xpath", f"//nav//a[contains(., '{title}')]").click()
     there = f"return document.querySelector('main h1')?.textContent === '{title}' && window.socket?.connected"
     wait_for(driver, there)

@@ -9,7 +9,7 @@ from typing import Any, Generic, TypeVar
 from nicegui import ui
 
 from nerif.app.forms import Form, FormField
-from nerif.app.scale import Scale
+from nerif.app.sliders import Scale
 
 __all__ = ["FormView"]
 
@@ -70,7 +70,7 @@ class FormView(Generic[T]):
         if name in self._controls:
             self._controls[name].set_value(_control_value(self.form.field(name), value))
         else:
-            self._changed(self.form.field(name), value)
+            self._set_value(self.form.field(name), value)
 
     def check(self) -> None:
         """Show the error of each field."""
@@ -102,7 +102,7 @@ class FormView(Generic[T]):
             control = self._control_of(field, _control_value(field, value))
             label = f"{field.label}{f' ({field.unit})' if field.unit else ''}"
             control.props(f'name="{field.name}" aria-label="{escape(label)}"')
-            control.on_value_change(lambda event: self._changed(field, _record_value(field, event.value)))
+            control.on_value_change(lambda event: self._set_value(field, _record_value(field, event.value)))
             self._controls[field.name] = control
             if field.name in self.sliders:
                 self._slider(field, control, f"{label}, slider")
@@ -147,7 +147,7 @@ class FormView(Generic[T]):
         text = ui.input(label, value=value).props("outlined dense debounce=250")
         return text.props(f'suffix="{field.unit}"') if field.unit else text
 
-    def _changed(self, field: FormField, value: Any) -> None:
+    def _set_value(self, field: FormField, value: Any) -> None:
         if self.values.get(field.name, field.default) == value:
             return
         self.values[field.name] = value

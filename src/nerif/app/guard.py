@@ -55,9 +55,9 @@ class Guard:
     def __init__(self, app: Any, token: str, hosts: Collection[str], port: int) -> None:
         self.app, self.token, self.cookie = app, token, cookie_of(token)
         self.name = f"nerif-{port}"  # cookies do not depend on the port
-        self.allowed = {f"{host}:{port}".lower() for host in hosts}
+        self.addresses = {f"{host}:{port}".lower() for host in hosts}
         if port == 80:
-            self.allowed |= {host.lower() for host in hosts}
+            self.addresses |= {host.lower() for host in hosts}
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass a request to the application, or refuse it."""
@@ -66,7 +66,7 @@ class Guard:
             return
         lines = [(name.decode("latin-1").lower(), value.decode("latin-1")) for name, value in scope["headers"]]
         headers, cookies = dict(lines), ";".join(value for name, value in lines if name == "cookie")
-        if headers.get("host", "").lower() not in self.allowed:
+        if headers.get("host", "").lower() not in self.addresses:
             await _refuse(scope, receive, send, 421, "This is not an address of this server.")
         elif "origin" in headers and not self._same_origin(headers["origin"]):
             await _refuse(scope, receive, send, 403, "The request came from another page.")
@@ -79,7 +79,7 @@ class Guard:
 
     def _same_origin(self, origin: str) -> bool:
         scheme, _, host = origin.lower().partition("://")
-        return scheme in ("http", "https") and host in self.allowed
+        return scheme in ("http", "https") and host in self.addresses
 
     def _has_cookie(self, cookies: str) -> bool:
         """Return whether the cookies, of any program on this machine, include that of the session."""

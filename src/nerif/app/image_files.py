@@ -1,4 +1,4 @@
-"""Images of a project as a page shows them: looks and small images, kept until their files change."""
+"""Images of a project for display, their quality and detected targets, cached until their files change."""
 
 from __future__ import annotations
 
@@ -17,11 +17,12 @@ from nerif.imaging.readers.views import View
 
 __all__ = ["ImageFiles"]
 
-MOST = 400  # entries that are kept
+LIMIT = 400  # of the cache, entries
+SAMPLE = 12  # images of a source whose quality is read
 
 
 class ImageFiles:
-    """What is shown of the images of one project.
+    """Images, quality and detected targets of the experiments of a project, cached.
 
     Parameters
     ----------
@@ -30,11 +31,11 @@ class ImageFiles:
 
     def __init__(self, project: Project) -> None:
         self.project = project
-        self._kept: OrderedDict[tuple[Any, ...], Any] = OrderedDict()  # least recently used first
-        self._lock = Lock()  # of what is kept: pages ask in threads
+        self._cache: OrderedDict[tuple[Any, ...], Any] = OrderedDict()  # least recently used first
+        self._lock = Lock()  # pages use the cache in threads
 
     def stamp(self, view: View, source: str) -> tuple[Any, ...]:
-        """Return what changes with the files of a source."""
+        """Return a value that changes with the files of a source."""
         name = view.sources.get(source, "")
         path = view.folder / name
         where = path if path.exists() else path.parent
@@ -45,39 +46,39 @@ class ImageFiles:
         )
         return len(result), max(f.st_mtime_ns for f in result), sum(f.st_size for f in result)
 
-    def look(self, view: View, source: str, most: int) -> ImageQuality:
-        """Return how the images of a source are; InputError where there are none of use."""
-        return self._once(view, source, ("look", most), lambda: image_quality(view, source, most))
+    def quality(self, view: View, source: str) -> ImageQuality:
+        """Return the quality of the images of a source; InputError if none can be used."""
+        return self._from_cache(view, source, ("quality",), lambda: image_quality(view, source, SAMPLE))
 
     def image(self, view: View, source: str, number: int, largest: int, crop: Crop | None, white: float = 0.0) -> str:
-        """Return an image in a data address: of a frame, or of the part that `crop` leaves of it."""
+        """Return a frame as the address of an image, cropped by `crop`."""
 
         def read() -> str:
             frames = view.open(source)
             image = frames[number]
             return jpeg_address(crop(image, frames.name(number)) if crop else image, largest, white)
 
-        return self._once(view, source, ("image", number, largest, crop, white), read)
+        return self._from_cache(view, source, ("image", number, largest, crop, white), read)
 
-    def result(self, view: View, source: str, number: int, target: CalibrationTarget) -> Detection | None:
+    def detection(self, view: View, source: str, number: int, target: CalibrationTarget) -> Detection | None:
         """Return the corners of a target in an image; None if it is not detected."""
 
         def read() -> Detection | None:
             frames = view.open(source)
             return target.detect(view.cropped(frames[number], frames.name(number)))
 
-        return self._once(view, source, ("found", number, target), read)
+        return self._from_cache(view, source, ("detection", number, target), read)
 
-    def _once(self, view: View, source: str, what: tuple[Any, ...], read: Any) -> Any:
+    def _from_cache(self, view: View, source: str, what: tuple[Any, ...], read: Any) -> Any:
         key = str(Path(view.folder)), view.name, view.sources.get(source), source, view.crop, what
         stamp = self.stamp(view, source) if source in view.sources else ()
         with self._lock:
-            memory = self._kept.get(key)
-        if memory is None or memory[0] != stamp:
-            memory = (stamp, read())
+            entry = self._cache.get(key)
+        if entry is None or entry[0] != stamp:
+            entry = (stamp, read())
         with self._lock:
-            self._kept[key] = memory
-            self._kept.move_to_end(key)
-            while len(self._kept) > MOST:
-                self._kept.popitem(last=False)
-        return memory[1]
+            self._cache[key] = entry
+            self._cache.move_to_end(key)
+            while len(self._cache) > LIMIT:
+                self._cache.popitem(last=False)
+        return entry[1]

@@ -7,13 +7,18 @@ from typing import Any
 
 from nicegui import ui
 
+from nerif.app.elements import CommandLine, refusals, text_html
 from nerif.app.form_view import FormView
 from nerif.app.forms import Form
-from nerif.app.job_status import LINES, JobStatus
-from nerif.app.pieces import CommandLine, refusals
+from nerif.app.jobs import REFUSED, Job
 from nerif.app.workspace import Workspace
+from nerif.common.conventions import InputError
 
-__all__ = ["JobForm"]
+__all__ = ["JobForm", "JobStatus"]
+
+EVERY = 0.7  # seconds
+LINES = 3  # of the log
+ENDS = {"done": "It is done.", "failed": "It failed; end of the log:", "stopped": "It was stopped.", "refused": REFUSED}
 
 
 class JobForm:
@@ -28,23 +33,23 @@ class JobForm:
     button : label of the button
     main : names of the fields at the top of the form
     out : returns the output, relative to the project; its folder is created
-    first : called before the run is queued; an InputError prevents the run
-    about : subject of the run, part of the key that restores its status after a reload
-    offer : called by a button that continues with the output; None for no button
+    before : called before the run is queued; an InputError prevents the run
+    subject : subject of the run, part of the key that restores its status after a reload
+    on_continue : called by a button that continues with the output; None for no button
     lines : number of log lines shown after success
     """
 
     def __init__(
         self, work: Workspace, name: str, form: Form[Any], words: Callable[[], Sequence[str]], button: str,
         main: Sequence[str] = (), out: Callable[[], str] | None = None,
-        first: Callable[[], Awaitable[None]] | None = None, about: str = "",
-        offer: Callable[[str], Awaitable[None]] | None = None, lines: int = LINES,
+        before: Callable[[], Awaitable[None]] | None = None, subject: str = "",
+        on_continue: Callable[[str], Awaitable[None]] | None = None, lines: int = LINES,
     ) -> None:  # fmt: skip
-        self.work, self.name, self.words, self.out, self.first = work, name, words, out, first
-        self.view = FormView(form, self._changed, work.draft(name), main)
+        self.work, self.name, self.words, self.out, self.before = work, name, words, out, before
+        self.view = FormView(form, self._on_change, work.draft(name), main)
         self.command = CommandLine()
         self.button = ui.button(button, icon="playlist_add", on_click=self._start).props("unelevated no-caps")
-        self.status = JobStatus(work, f"{name}.run {about}".strip(), offer=offer, lines=lines)
+        self.status = JobStatus(work, f"{name}.run {subject}".strip(), on_continue=on_continue, lines=lines)
         self.show()
 
     @property
@@ -58,16 +63,93 @@ class JobForm:
             self.command.show(self.arguments)
             self.button.set_enabled(self.view.valid)
 
-    def _changed(self) -> None:
+    def _on_change(self) -> None:
         self.work.keep(self.name, self.view.form.changed(self.view.values))
         self.show()
 
     async def _start(self) -> None:
         with refusals():
             self.view.record()
-            if self.first is not None:
-                await self.first()
+            if self.before is not None:
+                await self.before()
             if self.out is not None:
                 self.work.project.path(self.out()).parent.mkdir(parents=True, exist_ok=True)
             words = self.arguments
             self.status.follow(self.work.jobs.add(words, f"{words[0].capitalize()} {words[1]}"))
+
+
+class JobStatus:
+    """State and log of one run, added to the page under construction and restored after a reload.
+
+    Parameters
+    ----------
+    work : workspace of the project
+    name : key of the draft with the id of the run
+    on_end : called when the run has ended
+    on_continue : called by a button that continues with the output; None for no button
+    lines : number of log lines shown after success
+    """
+
+    def __init__(
+        self, work: Workspace, name: str, on_end: Callable[[Job], Awaitable[None]] | None = None,
+        on_continue: Callable[[str], Awaitable[None]] | None = None, lines: int = LINES,
+    ) -> None:  # fmt: skip
+        self.work, self.name, self.job = work, name, str(work.draft(name).get("job", ""))
+        self._on_end, self._on_continue, self._lines = on_end, on_continue, {"done": lines, "failed": 30}
+        self._content: tuple[str, ...] = ()
+        self.place = ui.element("div").props("role=status aria-live=polite")
+        self.further = ui.element("div")
+        with ui.element("div"):
+            ui.timer(EVERY, self._look)
+
+    def follow(self, job: Job) -> None:
+        """Show this run."""
+        self.job = job.id
+        self.work.keep(self.name, {"job": job.id})
+        self.further.clear()
+        self._show("It waits in the queue.")
+
+    def _show(self, text: str, log: Sequence[str] = ()) -> None:
+        if self._content == (text, *log):
+            return
+        self._content = (text, *log)
+        self.place.clear()
+        with self.place:
+            text_html(text, classes="status")
+            if log:
+                text_html("\n".join(log), "pre", "output")
+
+    def _forget(self) -> None:
+        """Show no run; the draft of a run started in another tab stays."""
+        if self.work.draft(self.name).get("job") == self.job:
+            self.work.keep(self.name, {})
+        self.job = ""
+
+    async def _look(self) -> None:
+        if not (id := self.job):
+            return
+        try:
+            job = await self.work.in_thread(self.work.jobs.get, id)
+            log = await self.work.in_thread(self.work.jobs.log, id, self._lines.get(job.state, LINES))
+        except InputError:  # removed in another tab
+            if id == self.job:
+                self._forget()
+            return
+        if id != self.job:  # another run has started meanwhile
+            return
+        lines = [line.rpartition("\r")[2] for line in log]  # the last state of a progress bar
+        if job.state not in ENDS:
+            self._show("It waits in the queue." if job.state == "queued" else f"It is {job.state}.", lines[-1:])
+            return
+        self._show(ENDS[job.state], lines)
+        self._forget()
+        if self._on_continue is not None and job.state == "done" and job.file:
+            self._go_on(self._on_continue, self.work.project.relative(job.file))
+        if self._on_end is not None:
+            await self._on_end(job)
+
+    def _go_on(self, on_continue: Callable[[str], Awaitable[None]], file: str) -> None:
+        self.further.clear()
+        with self.further:
+            button = ui.button(f"Go on with {file}", icon="arrow_forward", on_click=lambda: on_continue(file))
+            button.props("unelevated no-caps")

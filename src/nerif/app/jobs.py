@@ -45,7 +45,7 @@ __all__ = ["REFUSED", "Job", "Jobs", "command_line"]
 
 WAITING, OWNER = "waiting", "runner-"
 CLOCK = 1.5  # tolerance of the start time of a process, s
-MOST = 64  # simultaneous runs
+LIMIT = 64  # simultaneous runs
 RESUMABLE = ("reconstruct", "sequence")
 OVER = ("done", "failed", "stopped", "refused")
 REFUSED = (
@@ -248,11 +248,11 @@ class Jobs:
         self._swap(id, 1)
 
     def _swap(self, id: str, by: int) -> None:
-        waiting = [job for job in self.all() if job.state == "queued"]
-        at = next((i for i, job in enumerate(waiting) if job.id == id), None)
-        if at is None or not 0 <= at + by < len(waiting):
+        queue = [job for job in self.all() if job.state == "queued"]
+        at = next((i for i, job in enumerate(queue) if job.id == id), None)
+        if at is None or not 0 <= at + by < len(queue):
             return
-        job, other = waiting[at], waiting[at + by]
+        job, other = queue[at], queue[at + by]
         self._write(replace(job, place=other.place))
         self._write(replace(other, place=job.place))
 
@@ -267,12 +267,12 @@ class Jobs:
     def at_once(self) -> int:
         """Number of simultaneous runs."""
         count = _json(self.directory / "settings.json").get("at_once")
-        return count if isinstance(count, int) and 1 <= count <= MOST else 1
+        return count if isinstance(count, int) and 1 <= count <= LIMIT else 1
 
     @at_once.setter
     def at_once(self, count: int) -> None:
-        if not 1 <= count <= MOST:
-            raise InputError(f"expected 1 to {MOST} runs at the same time, got {count}", field="at_once")
+        if not 1 <= count <= LIMIT:
+            raise InputError(f"expected 1 to {LIMIT} runs at the same time, got {count}", field="at_once")
         self.directory.mkdir(parents=True, exist_ok=True)
         write_json(self.directory / "settings.json", {"at_once": int(count)})
 
@@ -313,14 +313,14 @@ class Jobs:
                 stdout=subprocess.DEVNULL, stderr=log, start_new_session=True,
             )  # fmt: skip
         assert runner.stdin is not None
-        claimed = claim(where, runner.pid)
+        is_claimed = claim(where, runner.pid)
         with suppress(BrokenPipeError), runner.stdin as order:  # the end of the runner is handled below
-            if claimed:
+            if is_claimed:
                 order.write(json.dumps(job.attempt).encode())
 
         def wait() -> None:
             code = runner.wait()  # the system may reuse the pid only after this
-            if claimed and code and not (where / STARTED).exists():
+            if is_claimed and code and not (where / STARTED).exists():
                 write_json(where / ENDED, {"code": code, "time": time.time()})
 
         threading.Thread(target=wait, daemon=True).start()

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from nicegui import ui
 
+from nerif.app.elements import images_html, refusals, select
 from nerif.app.jobs import Job
-from nerif.app.jobs_drawer import film_progress
-from nerif.app.live_surface import LiveSurface, caption_of
-from nerif.app.pieces import refusals
+from nerif.app.result_volumes import film_progress
+from nerif.app.surfaces import LiveSurface, caption_of
 from nerif.app.workspace import Workspace
 from nerif.common.conventions import unit_shown
 from nerif.data.volume import name_of
@@ -42,9 +42,7 @@ class LiveView:
         self._cache: dict[str, Any] = {}
         with ui.element("section").classes("card").props('aria-label="The run"'):
             ui.html("<h2>The run</h2>", sanitize=False)
-            self.choice = ui.select({}, label="Run", on_change=lambda e: self.follow(e.value)).props(
-                'outlined dense options-dense aria-label="Run"'
-            )
+            self.choice = select("Run", {}).on_value_change(lambda event: self.follow(event.value))
             self.status = ui.html("", sanitize=False).classes("status").props('aria-live="off"')
             self.bar = ui.linear_progress(0.0, show_value=False).props('aria-label="Progress"')
             with ui.row().classes("gap-2"):
@@ -54,7 +52,7 @@ class LiveView:
                 }
             self.chart = ui.echart(curve_options({})).classes("curve").style("height: 260px; width: 100%")
             self.surface = LiveSurface()
-            self.look = ui.html("", sanitize=False)
+            self.images = ui.html("", sanitize=False)
         self.chart.set_visibility(False)
         ui.timer(EVERY, self._refresh)
 
@@ -62,7 +60,7 @@ class LiveView:
         """Show this run."""
         if id and id != self.job:
             self.job, self._cache = id, {}
-            self.look.set_content("")
+            self.images.set_content("")
             self.surface.clear()
 
     async def _do(self, action: str) -> None:
@@ -71,7 +69,7 @@ class LiveView:
         await self._refresh()
 
     async def _refresh(self) -> None:
-        jobs = [job for job in await self.work.beside(self.work.jobs.all) if job.resumable]
+        jobs = [job for job in await self.work.in_thread(self.work.jobs.all) if job.resumable]
         options = {job.id: f"{job.title} ({job.state})" for job in jobs}
         if not self.job and jobs:
             self.follow(jobs[0].id)
@@ -88,13 +86,13 @@ class LiveView:
     async def _show(self, job: Job) -> None:
         out = self.work.project.path(job.out)
         if out.suffix == ".zarr":
-            share, title = await self.work.beside(film_progress, out)
+            share, title = await self.work.in_thread(film_progress, out)
             self.status.set_content(status_html(job, {}, title))
             self.bar.set_value(share)
             self.chart.set_visibility(False)
             return
         cache = self._cache
-        live, news = await self.work.beside(_update, out, cache)
+        live, news = await self.work.in_thread(_update, out, cache)
         if cache is not self._cache:  # another run has been selected meanwhile
             return
         self.status.set_content(status_html(job, live))
@@ -105,7 +103,7 @@ class LiveView:
             self.chart.options.update(curve_options(live["curve"]))
         if news is not None:
             images, box, caption = news
-            self.look.set_content(images)
+            self.images.set_content(images)
             if caption:
                 self.surface.show(job.out, cache[LIVE_FIELD], box, caption)
 
@@ -173,7 +171,7 @@ def curve_options(curve: dict[str, list[float | None]]) -> dict[str, Any]:
 
 def look_html(look: Look) -> str:
     """Return the images of a look as HTML: measured and predicted view, three central slices."""
-    figures = []
+    images = []
     unit = unit_shown(look.unit)
     for c, component in enumerate(look.components):
         measured, predicted = look.measured[..., c], look.predicted[..., c]
@@ -185,15 +183,11 @@ def look_html(look: Look) -> str:
         for kind, image in (("measured", measured), ("predicted", np.where(valid, predicted, np.nan))):
             residual = "" if kind == "measured" else f"; rms residual {rms:.2g} {unit}"
             text = f"{look.view} ({use}), {component} {kind}; {ends}{residual}"
-            figures.append((image_address(image, limits), text))
+            images.append((image_address(image, limits), text, text))
     z, y, x = (n // 2 for n in look.values.shape)
     limits = colour_range(look.values)
     for normal, image in (("z", look.values[z]), ("y", look.values[:, y]), ("x", look.values[:, :, x])):
         middle = (look.lower["xyz".index(normal)] + look.upper["xyz".index(normal)]) / 2
         text = f"{name_of(look.quantity)} at {normal} = {middle:g} mm; {limits[0]:.2g} to {limits[1]:.2g}"
-        figures.append((image_address(image[::-1], limits), text))
-    inside = "".join(
-        f'<figure><img src="{address}" alt="{escape(text)}"><figcaption>{escape(text)}</figcaption></figure>'
-        for address, text in figures
-    )
-    return f"<div class=images>{inside}</div><p class=note>After {look.seconds:.0f} s, {escape(look.title)}.</p>"
+        images.append((image_address(image[::-1], limits), text, text))
+    return f"{images_html(images)}<p class=note>After {look.seconds:.0f} s, {escape(look.title)}.</p>"

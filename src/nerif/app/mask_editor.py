@@ -1,18 +1,31 @@
-"""Editor of the flow mask of one view: polygons and brush strokes, by pointer or by typed coordinates."""
+"""Editor of the flow masks of a measurement: drawn in some views, by threshold in the others."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import asyncio
+from collections.abc import Awaitable, Callable, Mapping, Sequence
+from html import escape
+from pathlib import Path
 from typing import Any
 
 from nicegui import ui
 
-from nerif.app.mask_edits import MaskEdits
-from nerif.app.pieces import refusals
-from nerif.imaging.masks import MaskShape
+from nerif.app.edits import Edits, UndoButtons
+from nerif.app.elements import dialog, refusals, select, text_html
+from nerif.app.forms import Form
+from nerif.app.job_form import JobForm
+from nerif.app.project import OWN
+from nerif.app.view_maps import magnitude_address, threshold_address
+from nerif.app.workspace import Workspace
+from nerif.cli.commands.mask import Mask
+from nerif.data.measurement import Measurement
+from nerif.imaging.masks import MaskSettings, MaskShape, write_masks
 
-__all__ = ["MaskEditor"]
+__all__ = ["MaskCard"]
 
+Shapes = tuple[MaskShape, ...]
+
+SETTINGS = ("threshold", "smooth", "smallest", "grow", "sigma")
 TOOLS = {"polygon": "Polygon", "brush": "Brush"}
 EFFECTS = {True: "Flow is here", False: "No flow here"}
 STROKE = """(event) => { const me = event.currentTarget, r = me.getBoundingClientRect(), points = [];
@@ -23,6 +36,117 @@ const end = (e) => { me.removeEventListener('pointermove', add); emit(points.sli
 me.addEventListener('pointermove', add); me.addEventListener('pointerup', end, {once: true}); }"""
 
 
+class MaskCard:
+    """Mask editor, threshold settings and the run that applies them.
+
+    Parameters
+    ----------
+    work : Workspace
+    page : name of the page whose draft stores the shapes
+    name : measurement file, relative to the project
+    measurement : Measurement
+    on_continue : called with the file of the masked measurement
+    """
+
+    def __init__(
+        self, work: Workspace, page: str, name: str, measurement: Measurement,
+        on_continue: Callable[[str], Awaitable[None]],
+    ) -> None:  # fmt: skip
+        self.work, self.page, self.name, self.measurement = work, page, name, measurement
+        original: dict[str, Shapes] = dict.fromkeys(measurement.names, ())
+        self.edits = Edits(original, _shapes, work.draft(page).get("masks", {}).get(name))
+        self.view = select("View", list(measurement.names), measurement.names[0]).classes("short")
+        self.view.props["aria-label"] = "View to draw in"
+        with ui.element("div").classes("numbers"):
+            self.undo = UndoButtons(self.edits, self._step)
+            button = ui.button("Show the threshold's mask", icon="contrast", on_click=self._threshold)
+            button.props("flat no-caps dense")
+        self.place = ui.element("div").classes("stack")
+        self.status = ui.html("", sanitize=False).classes("status").props('aria-live="polite"')
+        record = Mask(Path(name), Path("masked.nc"))
+        self._lock = asyncio.Lock()
+        form = Form(record, only=SETTINGS)
+        self.job = JobForm(
+            work, f"{page}.mask", form, self._words, "Apply the masks", SETTINGS[:1], before=self._write, subject=name,
+            on_continue=on_continue,
+        )  # fmt: skip
+        self.view.on_value_change(self._build_editor)
+        self._build_editor()
+
+    @property
+    def folder(self) -> str:
+        """Folder of the drawn masks, relative to the project."""
+        return f"{OWN}/masks/{self.name.removesuffix('.nc')}"
+
+    @property
+    def out(self) -> str:
+        """Name of the new measurement."""
+        return self.work.project.free_name(f"{self.name.removesuffix('.nc')}.masked.nc")
+
+    def _words(self) -> list[str]:
+        option = ["--drawn", self.folder] if self.edits.changes else []
+        return ["mask", self.name, "--out", self.out, *option]
+
+    def _build_editor(self) -> None:
+        """Build the editor of the selected view."""
+        self.place.clear()
+        with self.place:
+            index = self.measurement.names.index(str(self.view.value))
+            shape = self.measurement.cameras[index].image_size
+            address = magnitude_address(self.measurement, index)
+            MaskEditor(str(self.view.value), shape, address, self.edits, self._store)
+        self._show_views()
+
+    def _step(self, view: str) -> None:
+        self.view.set_value(view)
+        self._build_editor()
+        self._store()
+
+    def _store(self) -> None:
+        """Store the shapes in the draft and as the images that `nerif mask` reads."""
+        draft = self.work.draft(self.page)
+        masks = {**draft.get("masks", {}), self.name: self.edits.draft}
+        self.work.keep(self.page, {**draft, "masks": masks})
+        self.job.show()
+        self.undo.show()
+        self._show_views()
+
+        async def write() -> None:
+            with refusals():
+                await self._write()
+
+        ui.timer(0.0, write, once=True)
+
+    async def _write(self) -> None:
+        """Write the masks as images in a thread, one write at a time."""
+        async with self._lock:
+            drawings, folder = self.edits.changes, self.work.project.path(self.folder)
+            sizes = {camera.name: camera.image_size for camera in self.measurement.cameras}
+
+            def work() -> None:
+                for old in folder.glob("*.png"):  # also those of views that have no shapes any more
+                    old.unlink()
+                if drawings:
+                    write_masks(folder, drawings, sizes)
+
+            await self.work.in_thread(work)
+
+    def _show_views(self) -> None:
+        views = ", ".join(self.edits.changes) or "no view"
+        self.status.set_content(escape(f"Drawn in {views}."))
+
+    async def _threshold(self) -> None:
+        index = self.measurement.names.index(str(self.view.value))
+        with refusals():
+            record = self.job.view.record()
+            settings: MaskSettings = record.masks
+            address = await self.work.in_thread(threshold_address, self.measurement, index, settings, record.sigma)
+            with dialog():
+                text_html(f"Threshold mask of view {self.view.value}; white: flow", "h3")
+                image = ui.element("img").style("width: min(70vw, 600px); image-rendering: pixelated")
+                image.props["src"], image.props["alt"] = address, "Threshold mask"
+
+
 class MaskEditor:
     """Tools, the image of the view and the shapes over it.
 
@@ -31,14 +155,14 @@ class MaskEditor:
     name : name of the view
     shape : height and width, px
     address : address of its image
-    edits : shapes of all views, changed in place
-    changed : called after each step
+    edits : shapes of all views, changes in place
+    on_change : called after each step
     """
 
     def __init__(
-        self, name: str, shape: tuple[int, int], address: str, edits: MaskEdits, changed: Callable[[], None]
+        self, name: str, shape: tuple[int, int], address: str, edits: Edits[Shapes], on_change: Callable[[], None]
     ) -> None:
-        self.name, self.shape, self.edits, self._changed = name, shape, edits, changed
+        self.name, self.shape, self.edits, self._on_change = name, shape, edits, on_change
         self.corners: list[tuple[float, float]] = []
         height, width = shape
         with ui.element("div").classes("numbers"):
@@ -53,7 +177,7 @@ class MaskEditor:
             self._over = ui.html("", sanitize=False).classes("over")
         with ui.element("div").classes("numbers"):
             self._x, self._y = self._number("Column", width), self._number("Row", height)
-            self._button("Add a corner", "add", self._typed)
+            self._button("Add a corner", "add", self._add_corner)
             self._button("Close the polygon", "pentagon", self._close)
             self._button("Clear the view", "layers_clear", lambda: self._put(()))
         self.show()
@@ -74,30 +198,30 @@ class MaskEditor:
         if self._tool.value == "brush":
             with refusals():
                 brush = MaskShape("brush", tuple(points), bool(self._inside.value), float(self._width.value or 0))
-                self._put((*self.edits.shapes[self.name], brush))
+                self._put((*self.edits.now[self.name], brush))
             return
         self.corners.append(points[-1])
         self.show()
 
-    def _typed(self) -> None:
+    def _add_corner(self) -> None:
         self.corners.append((float(self._x.value or 0), float(self._y.value or 0)))
         self.show()
 
     def _close(self) -> None:
         with refusals():
             polygon = MaskShape("polygon", tuple(self.corners), bool(self._inside.value))
-            self._put((*self.edits.shapes[self.name], polygon))
+            self._put((*self.edits.now[self.name], polygon))
 
-    def _put(self, shapes: tuple[MaskShape, ...]) -> None:
+    def _put(self, shapes: Shapes) -> None:
         self.corners = []
         self.edits.put(self.name, shapes)
         self.show()
-        self._changed()
+        self._on_change()
 
     def show(self) -> None:
         """Draw the shapes and the open polygon."""
         height, width = self.shape
-        shapes = "".join(map(_svg, self.edits.shapes[self.name]))
+        shapes = "".join(map(_svg, self.edits.now[self.name]))
         dots = "".join(f"<circle cx={x:.2f} cy={y:.2f} r={width / 120:.2f} />" for x, y in self.corners)
         path = " ".join(f"{x:.2f},{y:.2f}" for x, y in self.corners)
         draft = f"<g class=draft><polyline points='{path}' />{dots}</g>" if self.corners else ""
@@ -113,3 +237,9 @@ def _svg(shape: MaskShape) -> str:
         (x, y), r = shape.points[0], shape.width / 2
         return f"<circle class='{kind} dot' cx={x:.2f} cy={y:.2f} r={r:.2f} />"
     return f"<polyline class='{kind} brush' stroke-width={shape.width:.2f} points='{points}' />"
+
+
+def _shapes(entries: Sequence[Mapping[str, Any]]) -> Shapes:
+    """Return shapes from their entries in the draft."""
+    points = (tuple((float(x), float(y)) for x, y in shape["points"]) for shape in entries)
+    return tuple(MaskShape(**{**shape, "points": corners}) for shape, corners in zip(entries, points, strict=True))

@@ -16,7 +16,7 @@ from nerif.results.directory import LIVE, RUN
 __all__ = ["OWN", "Contents", "Project"]
 
 DEPTH = 3  # levels of folders that are searched
-MOST = 20_000  # entries that are searched
+LIMIT = 20_000  # entries that are searched
 OWN = ".nerif"
 
 T = TypeVar("T")
@@ -82,14 +82,14 @@ class Project:
     def free_name(self, stem: str, reserved: Collection[str] = ()) -> str:
         """Return the first of stem, stem-2, stem-3, ... that neither exists nor is in `reserved`."""
         first, ending = os.path.splitext(stem)
-        names = (stem if i == 1 else f"{first}-{i}{ending}" for i in range(1, MOST))
+        names = (stem if i == 1 else f"{first}-{i}{ending}" for i in range(1, LIMIT))
         return next(name for name in names if name not in reserved and not self.path(name).exists())
 
     def views(self, experiment: str) -> tuple[View, ...]:
         """Return the views of a folder of images; InputError if there are none."""
         return find_views(self.path(experiment))
 
-    def cached(self, name: str, what: str, read: Callable[[Path], T]) -> T:
+    def from_cache(self, name: str, what: str, read: Callable[[Path], T]) -> T:
         """Return `read` of a file, cached under `what` until the file changes."""
         path = self.path(name)
         status = path.stat()
@@ -129,7 +129,7 @@ class Project:
             return
         for entry in entries:
             count[0] += 1
-            if entry.name.startswith(".") or count[0] > MOST:
+            if entry.name.startswith(".") or count[0] > LIMIT:
                 continue
             path = Path(entry.path)
             if not entry.is_dir(follow_symlinks=False):
@@ -147,9 +147,9 @@ class Project:
                 return "films"
             return "results" if _is_result(path) else "experiments" if _has_views(path) else ""
         if path.suffix == ".toml":
-            return "calibrations" if self.cached(self.relative(path), "kind", _is_calibration) else ""
+            return "calibrations" if self.from_cache(self.relative(path), "kind", _is_calibration) else ""
         if path.suffix == ".nc" and path.name != "reprojection.nc":
-            measured = self.cached(self.relative(path), "kind", is_measurement)
+            measured = self.from_cache(self.relative(path), "kind", is_measurement)
             if measured:
                 return "measurements"
         return "volumes" if path.suffix in (".nc", ".vti") and not _is_result(path.parent) else ""

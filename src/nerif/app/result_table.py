@@ -50,15 +50,15 @@ class Row:
 
 def rows_of(project: Project, contents: Contents) -> list[Row]:
     """Return the rows of the results and then those of the films."""
-    rows = [_cached(project, name) for name in contents.results]
-    return rows + [row for name in contents.films if (row := _film(project, name)) is not None]
+    rows = [_row_of_result(project, name) for name in contents.results]
+    return rows + [row for name in contents.films if (row := _row_of_film(project, name)) is not None]
 
 
-def _cached(project: Project, name: str) -> Row:
+def _row_of_result(project: Project, name: str) -> Row:
     """The row of a result, cached until the newest of its files changes."""
     out = ResultDirectory(project.path(name))
     last = max(filter(out.has, (METRICS, FIELD, RUN, LIVE, VOLUME)), key=lambda n: (out / n).stat().st_mtime_ns)
-    return project.cached(f"{name}/{last}", "row", lambda _: _of(name, out.read(views=False)))
+    return project.from_cache(f"{name}/{last}", "row", lambda _: _of(name, out.read(views=False)))
 
 
 def _of(name: str, result: Result) -> Row:
@@ -76,7 +76,7 @@ def _of(name: str, result: Result) -> Row:
     return Row(name, cells, word, sentence, tuple(accuracy_rows(result)) if ended else ())
 
 
-def _film(project: Project, name: str) -> Row | None:
+def _row_of_film(project: Project, name: str) -> Row | None:
     """The row of a film, None for a store of measurements."""
     try:
         store = VolumeSequence(project.path(name))

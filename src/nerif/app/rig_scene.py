@@ -5,12 +5,13 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from html import escape
 from pathlib import Path
 
 import numpy as np
 from nicegui import ui
 
+from nerif.app.elements import table_html, text_html
+from nerif.app.surfaces import scene_of
 from nerif.common.conventions import InputError
 from nerif.geometry import Box, Camera
 from nerif.imaging.calibration.importers.importers import import_box, import_cameras
@@ -32,37 +33,35 @@ class Rig:
     Parameters
     ----------
     cameras : cameras that can be drawn
-    missing : data that the other cameras lack
+    gaps : data that the other cameras lack
     box : measurement volume
     errors : reprojection errors of the calibration images, empty if the file has none
     """
 
     cameras: tuple[Camera, ...]
-    missing: tuple[str, ...]
+    gaps: tuple[str, ...]
     box: Box | None
     errors: tuple[ImageError, ...]
 
 
 def read_rig(path: Path) -> Rig:
     """Read a calibration file."""
-    cameras, missing = [], []
+    cameras, gaps = [], []
     for camera in import_cameras(path):
         try:
             cameras.append(replace(camera, lens=None).camera())
         except InputError as error:
-            missing.append(str(error))
-    return Rig(tuple(cameras), tuple(missing), import_box(path), read_errors(path))
+            gaps.append(str(error))
+    return Rig(tuple(cameras), tuple(gaps), import_box(path), read_errors(path))
 
 
 def show_rig(rig: Rig) -> None:
     """Build the scene and the table."""
-    for text in rig.missing:
-        ui.html(f"<p class=note>{escape(text)}</p>", sanitize=False)
+    for text in rig.gaps:
+        text_html(text, classes="note")
     if not rig.cameras:
         return
-    camera = ui.scene.perspective_camera(fov=38)
-    scene = ui.scene(width=1080, height=460, grid=False, camera=camera, background_color="#eef1f4")
-    scene.classes("surface").props('role=img aria-label="The rig; drag to turn, scroll to zoom"')
+    scene = scene_of("The rig; drag to turn, scroll to zoom", 1080, 460)
     middle = np.zeros(3) if rig.box is None else np.array(rig.box.centre)
     outlines = [image_corners(c, middle) for c in rig.cameras]
     points = np.concatenate([np.concatenate([s.start, s.end]) for s in outlines] + [middle[None]])
@@ -107,18 +106,12 @@ def show_rig(rig: Rig) -> None:
 
 
 def _table(cameras: Sequence[Camera], errors: Sequence[ImageError]) -> str:
-    rows = []
+    rows: dict[str, tuple[str, ...]] = {}
     for camera in cameras:
         camera_errors = [e for e in errors if e.camera == camera.name]
         height, width = camera.image_size
         used = f"{sum(e.used for e in camera_errors)} of {len(camera_errors)}" if camera_errors else "unknown"
         rms = f"{rms_of(camera_errors):.3f}" if any(e.used for e in camera_errors) else "unknown"
         place = ", ".join(f"{round(float(x), 1) + 0.0:.1f}" for x in camera.centre)
-        cells = (f"{width} × {height}", f"{float(camera.intrinsics[0, 0]):.1f}", place, used, rms)
-        line = "".join(f"<td>{escape(cell)}</td>" for cell in cells)
-        rows.append(f"<tr><th scope=row>{escape(camera.name)}</th>{line}</tr>")
-    head = "".join(f"<th scope=col>{escape(title)}</th>" for title in HEAD)
-    return (
-        f"<div class=tabled tabindex=0 role=region aria-label=Cameras><table><thead><tr>{head}</tr></thead>"
-        f"<tbody>{''.join(rows)}</tbody></table></div>"
-    )
+        rows[camera.name] = (f"{width} × {height}", f"{float(camera.intrinsics[0, 0]):.1f}", place, used, rms)
+    return table_html("Cameras", HEAD, rows)

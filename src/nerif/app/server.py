@@ -19,12 +19,12 @@ from nicegui import app, background_tasks, ui
 from nicegui.server import Server
 from starlette.responses import RedirectResponse
 
-from nerif.app.frame import frame
+from nerif.app.frame import Page, frame
 from nerif.app.guard import Guard
-from nerif.app.pages import PAGES, Page
+from nerif.app.pages import PAGES
 from nerif.app.private import page_leading_to
 from nerif.app.project import Project
-from nerif.app.result_answers import ROUTES
+from nerif.app.routes import routes
 from nerif.app.workspace import READ_ONLY, Workspace
 from nerif.cli.commands.output import say
 from nerif.common.conventions import InputError
@@ -94,12 +94,12 @@ def serve(folder: Path, address: Address, browser: bool = True) -> None:
     logging.getLogger("uvicorn.error").addFilter(is_relevant)
     app.add_middleware(Guard, token=address.token, hosts=address.names, port=address.port)
     app.add_api_route("/", lambda: RedirectResponse(PAGES[0].path), include_in_schema=False)
-    for path, answer in ROUTES.items():
-        app.add_api_route(path, answer(work), include_in_schema=False)
+    for path, handler in routes(work).items():
+        app.add_api_route(path, handler, include_in_schema=False)
     for page in PAGES:
-        ui.page(page.path, response_timeout=30)(_built(work, page))
+        ui.page(page.path, response_timeout=30)(_handler(work, page))
 
-    async def begun() -> None:
+    async def announce() -> None:
         while not Server.instance.started:
             await asyncio.sleep(0.01)
         say(f"{work.project.folder}: {address.link}")
@@ -107,8 +107,8 @@ def serve(folder: Path, address: Address, browser: bool = True) -> None:
         if first:
             webbrowser.open(first)
 
-    app.on_startup(lambda: background_tasks.create(begun()))
-    app.on_startup(lambda: work.beside(work.project.contents))  # fills the cache: the first search takes longest
+    app.on_startup(lambda: background_tasks.create(announce()))
+    app.on_startup(work.contents)  # fills the cache: the first search takes longest
     app.timer(QUEUE_EVERY, work.jobs.advance)
     with ExitStack() as ending:
         first = ending.enter_context(page_leading_to(address.link)) if browser else ""
@@ -138,14 +138,14 @@ def is_relevant(record: logging.LogRecord) -> bool:
     return not (isinstance(error, RuntimeError) and str(error) == "No response returned.")
 
 
-def _built(work: Workspace, page: Page) -> Callable[[], Awaitable[None]]:
+def _handler(work: Workspace, page: Page) -> Callable[[], Awaitable[None]]:
     """The handler that builds a page within the frame."""
 
     async def build() -> None:
         with frame(work, page, PAGES):
-            pending = page.build(work)
-            if pending is not None:
-                await pending
+            coroutine = page.build(work)
+            if coroutine is not None:
+                await coroutine
 
     return build
 

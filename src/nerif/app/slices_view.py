@@ -9,7 +9,7 @@ from typing import Any
 
 from nicegui import ui
 
-from nerif.app.range_slider import RangeSlider
+from nerif.app.sliders import RangeSlider
 from nerif.app.workspace import Workspace
 from nerif.data.volume import Volume
 from nerif.geometry import Grid
@@ -47,9 +47,9 @@ class SlicesView:
         self.work = work
         self.panels: Sequence[Panel] = ()
         self._at = dict.fromkeys(NORMALS, 0.5)  # position along each axis, relative to its length
-        self._waiting: set[str] = set()
+        self._queue: set[str] = set()
         self._busy = False
-        self._built: tuple[Any, ...] = ()
+        self._layout: tuple[Any, ...] = ()
         self._images: dict[tuple[str, int], Any] = {}
         self._bars = ui.html("", sanitize=False)
         self._place = ui.element("div")
@@ -57,12 +57,12 @@ class SlicesView:
     async def show(self, panels: Sequence[Panel]) -> None:
         """Replace the panels; the slice positions stay."""
         self.panels = panels
-        built = tuple(p.title for p in panels), panels[0].volume.grid if panels else None
-        if built != self._built:
-            self._built = built
+        layout = tuple(p.title for p in panels), panels[0].volume.grid if panels else None
+        if layout != self._layout:
+            self._layout = layout
             self._build()
         self._bars.set_content(_bars(panels))
-        self._waiting |= set(NORMALS)
+        self._queue |= set(NORMALS)
         await self._draw()
 
     def _build(self) -> None:
@@ -82,7 +82,7 @@ class SlicesView:
 
         async def move(index: int) -> None:
             self._at[normal] = (index + 0.5) / len(along)
-            self._waiting.add(normal)
+            self._queue.add(normal)
             await self._draw()
 
         RangeSlider(
@@ -107,10 +107,10 @@ class SlicesView:
             return
         self._busy = True
         try:
-            while self._waiting:
-                normal = self._waiting.pop()
+            while self._queue:
+                normal = self._queue.pop()
                 panels, index = self.panels, self._index(normal) if self.panels else 0
-                addresses = await self.work.beside(_slice_addresses, panels, normal, index)
+                addresses = await self.work.in_thread(_slice_addresses, panels, normal, index)
                 if panels is self.panels:
                     self._put(normal, index, addresses)
         finally:
@@ -131,11 +131,11 @@ def _slice_addresses(panels: Sequence[Panel], normal: str, index: int) -> list[s
 
 def _bars(panels: Sequence[Panel]) -> str:
     """Colour bars as HTML, one for all panels of the same range."""
-    shared: dict[tuple[Any, ...], list[str]] = {}
+    groups: dict[tuple[Any, ...], list[str]] = {}
     for panel in panels:
-        shared.setdefault((panel.limits, panel.unit, panel.colours), []).append(panel.title)
+        groups.setdefault((panel.limits, panel.unit, panel.colours), []).append(panel.title)
     bars = []
-    for ((low, high), unit, colours), titles in shared.items():
+    for ((low, high), unit, colours), titles in groups.items():
         text = " and ".join(titles)
         bars.append(
             f"<figure><figcaption>{escape(text)}{f' [{escape(unit)}]' if unit else ''}</figcaption>"

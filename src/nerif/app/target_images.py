@@ -7,7 +7,7 @@ from html import escape
 
 from nicegui import ui
 
-from nerif.app.pieces import text_html
+from nerif.app.elements import text_html
 from nerif.app.workspace import Workspace
 from nerif.common.conventions import InputError
 from nerif.imaging.calibration.result import ImageError
@@ -27,17 +27,17 @@ class TargetImages:
     Parameters
     ----------
     work : Workspace
-    toggled : called with the name of an image that is excluded or included
+    on_toggle : called with the name of an image that is excluded or included
     """
 
-    def __init__(self, work: Workspace, toggled: Callable[[str], None]) -> None:
-        self.work, self.files, self._toggled = work, work.files, toggled
-        self._turn = 0
+    def __init__(self, work: Workspace, on_toggle: Callable[[str], None]) -> None:
+        self.work, self.files, self._on_toggle = work, work.files, on_toggle
+        self._request = 0
         self._place = ui.element("div").classes("stack")
 
     async def show(
         self, view: View, targets: Mapping[str, CalibrationTarget], errors: Mapping[str, ImageError],
-        excluded: Collection[str],
+        exclusions: Collection[str],
     ) -> None:  # fmt: skip
         """Show the images of a view one after the other; a later call replaces an earlier one.
 
@@ -46,10 +46,10 @@ class TargetImages:
         view : view of an experiment
         targets : targets in space and on the background
         errors : errors by the name of the image
-        excluded : names of images
+        exclusions : names of images
         """
-        self._turn += 1
-        turn = self._turn
+        self._request += 1
+        request = self._request
         self._place.clear()
         for source, title in SOURCES.items():
             if source not in view.sources:
@@ -57,12 +57,12 @@ class TargetImages:
                     text_html(f"{title}: there is no {view.name}/{source}.", classes="note")
                 continue
             try:
-                names = await self.work.beside(_poses, view, source)
+                names = await self.work.in_thread(_poses, view, source)
             except InputError as error:
                 with self._place:
                     text_html(str(error), classes="note")
                 continue
-            if turn != self._turn:
+            if request != self._request:
                 return
             with self._place, ui.element("div"):
                 text_html(title, "h3")
@@ -70,17 +70,17 @@ class TargetImages:
             for number, pose in enumerate(names):
                 name = f"{view.name}/{source}/{pose}"
                 try:
-                    address = await self.work.beside(self.files.image, view, source, number, LARGEST, view.crop)
-                    detection = await self.work.beside(self.files.result, view, source, number, targets[source])
-                    shape = await self.work.beside(self._shape, view, source)
+                    address = await self.work.in_thread(self.files.image, view, source, number, LARGEST, view.crop)
+                    detection = await self.work.in_thread(self.files.detection, view, source, number, targets[source])
+                    shape = await self.work.in_thread(self._shape, view, source)
                 except InputError as error:
                     with grid:
                         text_html(str(error), classes="missing note")
                     continue
-                if turn != self._turn:
+                if request != self._request:
                     return
                 with grid:
-                    self._cell(name, address, detection, shape, errors, name in excluded)
+                    self._cell(name, address, detection, shape, errors, name in exclusions)
 
     def _shape(self, view: View, source: str) -> tuple[int, int]:
         shape = view.open(source).shape
@@ -88,9 +88,9 @@ class TargetImages:
 
     def _cell(
         self, name: str, address: str, detection: Detection | None, shape: tuple[int, int],
-        errors: Mapping[str, ImageError], excluded: bool,
+        errors: Mapping[str, ImageError], exclusion: bool,
     ) -> None:  # fmt: skip
-        with ui.element("div").classes("target left-out" if excluded else "target") as cell:
+        with ui.element("div").classes("target left-out" if exclusion else "target") as cell:
             error = _error_html(errors.get(name)) or (", not used" if errors and detection is not None else "")
             count = "no target found" if detection is None else f"{len(detection.points)} points found"
             with ui.element("figure"):
@@ -101,7 +101,7 @@ class TargetImages:
                 )  # fmt: skip
             if detection is None:
                 return
-            state = [excluded]
+            state = [exclusion]
             button = ui.button().props("outline no-caps dense")
 
             def update() -> None:
@@ -115,7 +115,7 @@ class TargetImages:
             def toggle() -> None:
                 state[0] = not state[0]
                 update()
-                self._toggled(name)
+                self._on_toggle(name)
 
             button.on_click(toggle)
             update()

@@ -6,7 +6,9 @@ from html import escape
 
 import torch
 
+from nerif.app.elements import images_html
 from nerif.data.measurement import Measurement, integrals_of
+from nerif.geometry import Camera
 from nerif.imaging.masks import MaskSettings, with_flow_masks
 from nerif.report.view_images import image_address
 
@@ -31,8 +33,7 @@ def maps_html(measurement: Measurement) -> str:
     parts.append(f"<p class=note>{scale}</p>")
     for i, camera in enumerate(measurement.cameras):
         height, width = camera.image_size
-        step = -(-max(height, width) // PIXELS)
-        part = i, slice(0, height, step), slice(0, width, step)
+        part = _pixels(i, camera, PIXELS)
         images = {
             name: image_address(values[part][..., c].numpy(), (least, most))
             for c, name in enumerate(observation.components)
@@ -41,21 +42,14 @@ def maps_html(measurement: Measurement) -> str:
             images["sigma"] = image_address(sigma[part].numpy(), (0.0, noisiest), "viridis")
         images["valid"] = image_address(usable[part].numpy().astype(float), (0.0, 1.0), "gray")
         share = float(usable[i, :height, :width].float().mean())
-        figures = "".join(
-            f'<figure><img src="{address}" alt="{escape(f"{name} of view {camera.name}", quote=True)}">'
-            f"<figcaption>{escape(name)}</figcaption></figure>"
-            for name, address in images.items()
-        )
-        parts.append(f"<h3>{escape(camera.name)}, {share:.1%} valid</h3><div class=images>{figures}</div>")
+        row = images_html([(address, f"{name} of view {camera.name}", name) for name, address in images.items()])
+        parts.append(f"<h3>{escape(camera.name)}, {share:.1%} valid</h3>{row}")
     return "".join(parts)
 
 
 def magnitude_address(measurement: Measurement, view: int) -> str:
     """Return the magnitude of the signal of a view as an image."""
-    (observation, *_), camera = integrals_of(measurement), measurement.cameras[view]
-    height, width = camera.image_size
-    step = -(-max(height, width) // (3 * PIXELS))
-    part = view, slice(0, height, step), slice(0, width, step)
+    (observation, *_), part = integrals_of(measurement), _pixels(view, measurement.cameras[view], 3 * PIXELS)
     size = observation.values[part].norm(dim=-1).where(measurement.usable[part], torch.tensor(float("nan")))
     return image_address(size.numpy(), (0.0, _largest(size)), "viridis")
 
@@ -67,6 +61,13 @@ def threshold_address(measurement: Measurement, view: int, settings: MaskSetting
     assert masked.flow_mask is not None
     height, width = measurement.cameras[view].image_size
     return image_address(masked.flow_mask[0, :height, :width].numpy().astype(float), (0.0, 1.0), "gray")
+
+
+def _pixels(view: int, camera: Camera, limit: int) -> tuple[int, slice, slice]:
+    """Return the index of the pixels of a view that an image with `limit` pixels along the longer edge shows."""
+    height, width = camera.image_size
+    step = -(-max(height, width) // limit)
+    return view, slice(0, height, step), slice(0, width, step)
 
 
 def _largest(values: torch.Tensor) -> float:

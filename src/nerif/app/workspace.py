@@ -11,7 +11,7 @@ from typing import Any, ParamSpec, TypeVar
 
 from nerif.app.image_files import ImageFiles
 from nerif.app.jobs import Jobs
-from nerif.app.project import OWN, Project
+from nerif.app.project import OWN, Contents, Project
 from nerif.common.files import write_json
 
 __all__ = ["READ_ONLY", "Workspace"]
@@ -58,6 +58,14 @@ class Workspace:
             if error.errno not in NOT_WRITABLE:
                 raise
 
-    async def beside(self, work: Callable[P, T], *arguments: P.args, **named: P.kwargs) -> T:
+    async def contents(self) -> Contents:
+        """Return the files of the project as they are now."""
+        return await self.in_thread(self.project.contents)
+
+    async def measurements(self) -> tuple[str, ...]:
+        """Return the measurement files as they are now."""
+        return (await self.contents()).measurements
+
+    async def in_thread(self, work: Callable[P, T], *arguments: P.args, **keywords: P.kwargs) -> T:
         """Run blocking work in a thread, so that pages stay responsive."""
-        return await asyncio.to_thread(work, *arguments, **named)
+        return await asyncio.to_thread(work, *arguments, **keywords)

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+from nerif.app.frame import Page
 from nerif.app.pages import calibration, check, design, displacement, images, reconstruct, results
-from nerif.app.pages.page import Page
 
-__all__ = ["PAGES", "Page"]
+__all__ = ["PAGES"]
 
 PAGES: tuple[Page, ...] = (
     design.PAGE, images.PAGE, calibration.PAGE, displacement.PAGE, check.PAGE, reconstruct.PAGE, results.PAGE,

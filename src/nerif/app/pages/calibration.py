@@ -8,12 +8,12 @@ from typing import Any
 import tyro
 from nicegui import ui
 
+from nerif.app.elements import CommandLine, card, refusals, select, text_html
 from nerif.app.form_view import FormView
 from nerif.app.forms import Form
-from nerif.app.job_status import JobStatus
+from nerif.app.frame import Page
+from nerif.app.job_form import JobStatus
 from nerif.app.jobs import Job
-from nerif.app.pages.page import Page
-from nerif.app.pieces import CommandLine, card, refusals, text_html
 from nerif.app.project import Contents
 from nerif.app.rig_scene import read_rig, show_rig
 from nerif.app.target_images import TargetImages
@@ -52,26 +52,24 @@ def form_of(simple: bool, settings: dict[str, Any] | None = None) -> Form[Calibr
 class CalibrationPage:
     """The page in one tab."""
 
-    def __init__(self, work: Workspace, outcome: Contents) -> None:
-        self.work, self.outcome = work, outcome
-        memory = work.draft(PAGE.name)
-        self.memory = dict(memory)
-        self.left_out: dict[str, list[str]] = {k: list(v) for k, v in memory.get("leave_out", {}).items()}
-        self.values: dict[str, dict[str, Any]] = {name: dict(memory.get(name, {})) for name in ("target", "ruler")}
+    def __init__(self, work: Workspace, contents: Contents) -> None:
+        self.work, self.contents = work, contents
+        draft = work.draft(PAGE.name)
+        self.draft = dict(draft)
+        self.exclusions: dict[str, list[str]] = {k: list(v) for k, v in draft.get("leave_out", {}).items()}
+        self.values: dict[str, dict[str, Any]] = {name: dict(draft.get(name, {})) for name in ("target", "ruler")}
         self.views: dict[str, View] = {}
         self.errors: dict[str, ImageError] = {}
-        self.turn = 0  # of drawing the rig
-        self.visible: tuple[Any, ...] = ()
-        experiments = list(outcome.experiments)
-        available = memory.get("experiment")
+        self.request = 0  # number of the last drawing of the rig
+        self._display: tuple[Any, ...] = ()  # `_display_key` of the images on the page
+        experiments = list(contents.experiments)
         with ui.element("div").classes("columns"):
             with card("Calibrate"), ui.element("div").classes("form"):
                 if not experiments:
                     text_html("There are no images in this folder yet; the page Images says where they go.")
-                first = available if available in experiments else next(iter(experiments), None)
-                self.experiment = self._select("Experiment", experiments, first)
-                self.way = self._select("From", WAYS, bool(memory.get("simple", False)))
-                self.out = ui.input("Calibration to write", value=str(memory.get("out", "calibration.toml")))
+                self.experiment = select("Experiment", experiments, draft.get("experiment")).classes("short")
+                self.way = select("From", WAYS, bool(draft.get("simple", False))).classes("short")
+                self.out = ui.input("Calibration to write", value=str(draft.get("out", "calibration.toml")))
                 self.out.props("outlined dense debounce=250").props["aria-label"] = "Calibration to write"
                 self.out.on_value_change(self._show)
                 self.note = ui.element("div")
@@ -81,32 +79,27 @@ class CalibrationPage:
             with ui.element("div").classes("stack"):
                 with card("The same on the command line"):
                     self.command = CommandLine()
-                    self.notice = JobStatus(work, f"{PAGE.name}.run", self._ended)
+                    self.status = JobStatus(work, f"{PAGE.name}.run", self._on_end)
                 with card("The rig"):
-                    self.calibration = self._select("Calibration", list(outcome.calibrations), None)
+                    self.calibration = select("Calibration", []).classes("short")
                     self.rig = ui.element("div").classes("rig")
                 with card("Images of the target", "Circles: detected points, the first one filled. "
                           "Left-out images are part of the command line; calibrate again after it."):  # fmt: skip
-                    self.view = self._select("View", [], None)
-                    self.images = TargetImages(work, self._toggled)
-
-    def _select(self, label: str, options: Any, value: Any) -> ui.select:
-        select = ui.select(options, label=label, value=value).props("outlined dense options-dense").classes("short")
-        select.props["aria-label"] = label
-        return select
+                    self.view = select("View", []).classes("short")
+                    self.images = TargetImages(work, self._toggle)
 
     # -- the form ------------------------------------------------------------------------------------------------
 
     async def build(self) -> None:
-        """Fill the page, and listen."""
-        await self._turned()
+        """Fill the page and handle changes."""
+        await self._update_form()
         await self._choose_calibration()
-        self.experiment.on_value_change(self._turned)
-        self.way.on_value_change(self._turned)
-        self.calibration.on_value_change(self._draw)
-        self.view.on_value_change(self._images)
-        await self._draw()
-        ui.timer(EVERY, self._look_again)
+        self.experiment.on_value_change(self._update_form)
+        self.way.on_value_change(self._update_form)
+        self.calibration.on_value_change(self._show_rig)
+        self.view.on_value_change(self._show_images)
+        await self._show_rig()
+        ui.timer(EVERY, self._update_images)
 
     @property
     def simple(self) -> bool:
@@ -115,18 +108,18 @@ class CalibrationPage:
 
     @property
     def settings(self) -> str:
-        """The file of settings that lies beside the images, relative to the project; empty if there is none."""
+        """The settings file beside the images, relative to the project; empty if there is none."""
         name = f"{self.experiment.value}/{SETTINGS}"
-        there = self.experiment.value and not self.simple and self.work.project.path(name).is_file()
-        return name if there else ""
+        exists = self.experiment.value and not self.simple and self.work.project.path(name).is_file()
+        return name if exists else ""
 
-    async def _turned(self) -> None:
-        """Another experiment, or another way."""
+    async def _update_form(self) -> None:
+        """Build the form of another experiment or of the other way."""
         self.views = {}
         if self.experiment.value:
             with refusals():
-                outcome = await self.work.beside(self.work.project.views, self.experiment.value)
-                self.views = {view.name: view for view in outcome}
+                views = await self.work.in_thread(self.work.project.views, self.experiment.value)
+                self.views = {view.name: view for view in views}
         settings: dict[str, Any] = {}
         if self.settings:
             with refusals():
@@ -138,15 +131,15 @@ class CalibrationPage:
         with self.place:
             values = self.values["ruler" if self.simple else "target"]
             self.form = FormView(form, self._show, values, SIMPLE_MAIN if self.simple else MAIN)
-        named = list(self.views)
-        memory = self.memory.get("view")
-        self.view.set_options(named, value=memory if memory in named else next(iter(named), None))
+        names = list(self.views)
+        name = self.draft.get("view")
+        self.view.set_options(names, value=name if name in names else next(iter(names), None))
         self._show()
 
     @property
-    def left(self) -> list[str]:
-        """Names of the images of this experiment that are left out."""
-        return self.left_out.setdefault(self.experiment.value or "", [])
+    def excluded_images(self) -> list[str]:
+        """Names of the excluded images of this experiment."""
+        return self.exclusions.setdefault(self.experiment.value or "", [])
 
     def arguments(self) -> list[str]:
         """Return the arguments of nerif that the page is set to."""
@@ -154,7 +147,7 @@ class CalibrationPage:
         words += ["--config", self.settings] if self.settings else []
         words += ["--simple"] if self.simple else []
         words += self.form.arguments
-        words += ["--leave-out", *self.left] if self.left and not self.simple else []
+        words += ["--leave-out", *self.excluded_images] if self.excluded_images and not self.simple else []
         return [*words, "--force"] if self._exists() else words
 
     def _exists(self) -> bool:
@@ -167,11 +160,11 @@ class CalibrationPage:
         if not hasattr(self, "form"):
             return
         self.values["ruler" if self.simple else "target"] = self.form.form.changed(self.form.values)
-        self.memory = {
+        self.draft = {
             "experiment": self.experiment.value, "simple": self.simple, "out": self.out.value, "view": self.view.value,
-            "leave_out": self.left_out, "calibration": self.calibration.value, **self.values,
+            "leave_out": self.exclusions, "calibration": self.calibration.value, **self.values,
         }  # fmt: skip
-        self.work.keep(PAGE.name, self.memory)
+        self.work.keep(PAGE.name, self.draft)
         self.command.show(self.arguments())
         notes = [f"Its settings are those of {self.settings}, but for what is changed here."] if self.settings else []
         notes += [f"{self.out.value} is there; it is replaced."] if self._exists() else []
@@ -181,12 +174,12 @@ class CalibrationPage:
                 text_html(text, classes="note")
         self.start.set_enabled(bool(self.experiment.value and self.out.value) and self.form.valid)
 
-    def _toggled(self, name: str) -> None:
-        left = self.left
-        if name in left:
-            left.remove(name)
+    def _toggle(self, name: str) -> None:
+        names = self.excluded_images
+        if name in names:
+            names.remove(name)
         else:
-            left.append(name)
+            names.append(name)
         self._show()
 
     # -- the run -------------------------------------------------------------------------------------------------
@@ -195,32 +188,32 @@ class CalibrationPage:
         with refusals():
             self.form.record()
             self.work.project.path(self.out.value).parent.mkdir(parents=True, exist_ok=True)
-            self.notice.follow(self.work.jobs.add(self.arguments(), f"Calibrate {self.experiment.value}"))
+            self.status.follow(self.work.jobs.add(self.arguments(), f"Calibrate {self.experiment.value}"))
 
-    async def _ended(self, job: Job) -> None:
+    async def _on_end(self, job: Job) -> None:
         """Show what the run wrote."""
         if job.state == "done":
-            self.outcome = await self.work.beside(self.work.project.contents)
+            self.contents = await self.work.contents()
             await self._choose_calibration(self.work.project.relative(job.file))
-            await self._draw()
+            await self._show_rig()
         self._show()
 
     # -- results -------------------------------------------------------------------------------------------
 
     async def _choose_calibration(self, name: str | None = None) -> None:
-        names = sorted(self.outcome.calibrations, key=lambda n: (n.count("/"), n))
-        best = [n for n in (name, self.calibration.value, self.memory.get("calibration"), self.out.value) if n in names]
+        names = sorted(self.contents.calibrations, key=lambda n: (n.count("/"), n))
+        best = [n for n in (name, self.calibration.value, self.draft.get("calibration"), self.out.value) if n in names]
         self.calibration.set_options(names, value=next(iter([*best, *names]), None))
 
-    async def _draw(self) -> None:
-        """Show the rig of the calibration that is chosen, and its errors beside the images."""
-        self.turn += 1
-        turn, name, rig = self.turn, self.calibration.value, None
+    async def _show_rig(self) -> None:
+        """Show the rig of the selected calibration, and its errors beside the images."""
+        self.request += 1
+        request, name, rig = self.request, self.calibration.value, None
         lines = [] if name else ["There is no calibration in this folder yet."]
         if name:
             with refusals(lines.append):
-                rig = await self.work.beside(read_rig, self.work.project.path(name))
-        if turn != self.turn:  # another one has been chosen meanwhile
+                rig = await self.work.in_thread(read_rig, self.work.project.path(name))
+        if request != self.request:  # another one has been selected meanwhile
             return
         self.errors = {error.name: error for error in rig.errors} if rig else {}
         self.rig.clear()
@@ -230,35 +223,35 @@ class CalibrationPage:
             if rig:
                 show_rig(rig)
         self._show()
-        await self._images()
+        await self._show_images()
 
-    async def _images(self) -> None:
-        """Show the images of the view that is chosen."""
+    async def _show_images(self) -> None:
+        """Show the images of the selected view."""
         view = self.views.get(self.view.value or "")
         if view is None or not self.form.valid:
             return
         self._show()
         with refusals():
-            targets, self.visible = self._targets(), self._wanted()
-            await self.images.show(view, targets, self.errors, self.left)
+            targets, self._display = self._targets(), self._display_key()
+            await self.images.show(view, targets, self.errors, self.excluded_images)
 
     def _targets(self) -> dict[str, CalibrationTarget]:
-        """What is looked for; a ruler needs none, then it is that of the form's defaults."""
-        made = form_of(False).record if self.simple else self.form.record()
-        return {"target": made.target, "background": made.target.scaled(made.background_scale)}
+        """The targets to detect; for a ruler, which needs none, those of the form's defaults."""
+        record = form_of(False).record if self.simple else self.form.record()
+        return {"target": record.target, "background": record.target.scaled(record.background_scale)}
 
-    def _wanted(self) -> tuple[Any, ...]:
+    def _display_key(self) -> tuple[Any, ...]:
         return self.experiment.value, self.view.value, *self._targets().values()
 
-    async def _look_again(self) -> None:
-        """Detect again with another target or another experiment."""
-        if self.form.valid and self._wanted() != self.visible:
-            await self._images()
+    async def _update_images(self) -> None:
+        """Detect again if target, experiment or view has changed."""
+        if self.form.valid and self._display_key() != self._display:
+            await self._show_images()
 
 
 async def build(work: Workspace) -> None:
     """Build the page."""
-    page = CalibrationPage(work, await work.beside(work.project.contents))
+    page = CalibrationPage(work, await work.contents())
     with ui.element("div"):
         ui.timer(0.01, page.build, once=True)  # the page is there before its images are looked through
 

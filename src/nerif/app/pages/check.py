@@ -4,18 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from html import escape
 
 from nicegui import ui
 
 from nerif.analysis.consistency import Consistency, check_consistency
-from nerif.app.file_choice import FileChoice
+from nerif.app.elements import (
+    CommandLine,
+    FileChoice,
+    card,
+    items_html,
+    refusals,
+    table_html,
+    text_html,
+    work_in_progress,
+)
 from nerif.app.form_view import FormView
 from nerif.app.forms import Form
-from nerif.app.job_form import JobForm
-from nerif.app.job_status import JobStatus
-from nerif.app.pages.page import Page
-from nerif.app.pieces import CommandLine, card, refusals, text_html
+from nerif.app.frame import Page
+from nerif.app.job_form import JobForm, JobStatus
 from nerif.app.workspace import Workspace
 from nerif.cli.commands.check import Check
 from nerif.data.measurement import Measurement
@@ -24,9 +30,9 @@ __all__ = ["PAGE"]
 
 AGREE = "Each is predicted by a quick reconstruction from the others."
 REFINE = "Cameras are refined with a quick field: which one is off?"
-COMPARED = ("voxels", "aperture")
-REFINED_LINES = 60  # of its output: a table of the views and the findings
-REFINED = ("pose_sigma_mm", "pose_sigma_deg", "time_limit", "aperture")
+VIEW_SETTINGS = ("voxels", "aperture")
+RIG_LINES = 60  # of its output: a table of the views and the findings
+RIG_SETTINGS = ("pose_sigma_mm", "pose_sigma_deg", "time_limit", "aperture")
 
 
 class CheckPage:
@@ -40,21 +46,20 @@ class CheckPage:
 
     def __init__(self, work: Workspace, measurements: Sequence[str]) -> None:
         self.work = work
-        memory = work.draft(PAGE.name)
+        draft = work.draft(PAGE.name)
         with ui.element("div").classes("columns"):
             with ui.element("div").classes("stack"):
                 with card("Do the views agree?", AGREE), ui.element("div").classes("form"):
-                    self.choice = FileChoice(
-                        "Measurement", measurements, memory.get("measurement"), self._there, self._turned
-                    )
-                    self.form = FormView(Form(self._record(), only=COMPARED), self._changed, memory.get("values"))
+                    name = draft.get("measurement")
+                    self.choice = FileChoice("Measurement", measurements, name, work.measurements, self._on_choice)
+                    self.form = FormView(Form(self._record(), only=VIEW_SETTINGS), self._on_change, draft.get("values"))
                     self.button = ui.button("Compare the views", icon="rule", on_click=self.compare)
                     self.button.props("unelevated no-caps")
                 with card("Is the rig as it was calibrated?", REFINE), ui.element("div").classes("form"):
                     record = replace(self._record(), refine=("cameras",))
                     self.rig = JobForm(
-                        work, f"{PAGE.name}.rig", Form(record, only=REFINED), self._refine_words, "Refine",
-                        lines=REFINED_LINES,
+                        work, f"{PAGE.name}.rig", Form(record, only=RIG_SETTINGS), self._refine_words, "Refine",
+                        lines=RIG_LINES,
                     )  # fmt: skip
             with ui.element("div").classes("stack"):
                 with card("The same on the command line"):
@@ -64,12 +69,9 @@ class CheckPage:
                     with self.notice:
                         text_html("The views have not been compared yet.", classes="status")
                 with card("Undone") as self.correction:
-                    self.correcting = JobStatus(work, f"{PAGE.name}.undone", offer=self.choice.choose)
-        self.correction.set_visibility(bool(self.correcting.job))
+                    self.correction_status = JobStatus(work, f"{PAGE.name}.undone", on_continue=self.choice.choose)
+        self.correction.set_visibility(bool(self.correction_status.job))
         self.show()
-
-    async def _there(self) -> Sequence[str]:
-        return (await self.work.beside(self.work.project.contents)).measurements
 
     def _keep(self) -> None:
         values = self.form.form.changed(self.form.values)
@@ -86,7 +88,7 @@ class CheckPage:
         self.command.show(self.arguments)
         self.button.set_enabled(self.form.valid)
 
-    def _changed(self) -> None:
+    def _on_change(self) -> None:
         self._keep()
         self.show()
 
@@ -95,9 +97,9 @@ class CheckPage:
         """Arguments of nerif that compare the views."""
         return ["check", self.choice.name, *self.form.arguments]
 
-    def _turned(self) -> None:
+    def _on_choice(self) -> None:
         self._keep()
-        self.correction.set_visibility(bool(self.correcting.job))
+        self.correction.set_visibility(bool(self.correction_status.job))
         self.notice.clear()
         self.show()
         self.rig.show()
@@ -105,56 +107,47 @@ class CheckPage:
     async def compare(self) -> None:
         """Compare the views and show the findings."""
         name, arguments = self.choice.name, self.arguments
-        self.notice.clear()
-        with self.notice:
-            bar = ui.linear_progress(0, show_value=False).props('aria-label="Comparing the views"')
-        self.button.disable()
-        done = [0.0]
-        timer = ui.timer(0.3, lambda: bar.set_value(done[0]))
+        progress = [0.0]
 
         def step(count: int, total: int) -> None:
-            done[0] = count / max(total, 1)
+            progress[0] = count / max(total, 1)
+
+        def work(settings: Check) -> Consistency:
+            measurement = Measurement.read(self.work.project.path(name))
+            return check_consistency(measurement, settings.voxels, step, settings.aperture)
 
         messages: list[str] = []
         result = None
-        with refusals(messages.append):
-            request = self.form.record()
-
-            def work() -> Consistency:
-                measurement = Measurement.read(self.work.project.path(name))
-                return check_consistency(measurement, request.voxels, step, request.aperture)
-
-            result = await self.work.beside(work)
-        timer.cancel()
-        self.button.enable()
-        self.notice.clear()
+        with work_in_progress(self.button, self.notice), refusals(messages.append):
+            with self.notice:
+                bar = ui.linear_progress(0, show_value=False).props('aria-label="Comparing the views"')
+                ui.timer(0.3, lambda: bar.set_value(progress[0]))
+            result = await self.work.in_thread(work, self.form.record())
         with self.notice:
             for text in messages:
                 text_html(text, classes="status")
             if result is not None:
                 self._show(name, arguments, result)
 
-    def _show(self, name: str, compared: Sequence[str], result: Consistency) -> None:
+    def _show(self, name: str, words: Sequence[str], result: Consistency) -> None:
         """The verdicts, and the correction that is offered."""
         ui.html(views_table(result), sanitize=False)
-        notes = "".join(f"<li>{escape(text)}</li>" for text in result.remarks)
-        findings = "".join(f"<li>{escape(str(finding))}</li>" for finding in result.findings)
-        if findings:
-            ui.html(f"<h3>Found</h3><ul class=notes>{findings}</ul>", sanitize=False)
+        if result.findings:
+            ui.html(f"<h3>Found</h3>{items_html([str(finding) for finding in result.findings])}", sanitize=False)
         elif result.views:
             text_html("No problems found.", classes="status")
-        if notes:
-            ui.html(f"<h3>Notes</h3><ul>{notes}</ul>", sanitize=False)
+        if result.remarks:
+            ui.html(f"<h3>Notes</h3>{items_html(result.remarks, '')}", sanitize=False)
         if result.corrections:
             out = self.work.project.free_name(f"{name.removesuffix('.nc')}.corrected.nc")
-            arguments = [*compared, "--out", out]
+            arguments = [*words, "--out", out]
             text_html("The mistakes can be undone, in a new file:", "h3")
             line = CommandLine()
             line.show(arguments)
 
             def correct() -> None:
                 with refusals():
-                    self.correcting.follow(self.work.jobs.add(arguments, f"Correct {name}"))
+                    self.correction_status.follow(self.work.jobs.add(arguments, f"Correct {name}"))
                     self.correction.set_visibility(True)
                     button.disable()
 
@@ -169,23 +162,20 @@ def views_table(result: Consistency) -> str:
     """Return the agreement of every view as HTML; nothing where there are too few views."""
     if not result.views:
         return ""
-    rows = "".join(
-        f"<tr><th scope=row>{escape(v.name)}</th><td>{escape(v.measured)}</td><td>{v.valid:.1%}</td>"
-        f"<td>{v.agreement:.2f}</td><td>{v.gain:.2f}</td><td>{escape(v.verdict or 'fits')}</td></tr>"
+    rows = {
+        v.name: (v.measured, f"{v.valid:.1%}", f"{v.agreement:.2f}", f"{v.gain:.2f}", v.verdict or "fits")
         for v in result.views
-    )
-    heads = "".join(f"<th scope=col>{h}</th>" for h in ("View", "Measured", "Valid", "Agreement", "Gain", "Verdict"))
-    table = f"<table><thead><tr>{heads}</tr></thead><tbody>{rows}</tbody></table>"
-    return f'<div class=tabled tabindex=0 role=region aria-label="Agreement of the views">{table}</div>'
+    }
+    return table_html("Agreement of the views", ("View", "Measured", "Valid", "Agreement", "Gain", "Verdict"), rows)
 
 
 async def build(work: Workspace) -> None:
     """Build the page."""
-    contents = await work.beside(work.project.contents)
-    if not contents.measurements:
+    measurements = await work.measurements()
+    if not measurements:
         text_html("There is no measurement in the folder yet: Displacement makes one of images.", classes="status")
         return
-    CheckPage(work, contents.measurements)
+    CheckPage(work, measurements)
 
 
 PAGE = Page("check", "Check", "/check", "Mistakes that cost a day, found before the reconstruction.", build)

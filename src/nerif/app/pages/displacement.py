@@ -8,12 +8,11 @@ from pathlib import Path
 
 from nicegui import ui
 
-from nerif.app.file_choice import FileChoice
+from nerif.app.elements import FileChoice, card, refusals, select, text_html, work_in_progress
 from nerif.app.forms import Form
+from nerif.app.frame import Page
 from nerif.app.job_form import JobForm
-from nerif.app.mask_card import MaskCard
-from nerif.app.pages.page import Page
-from nerif.app.pieces import card, refusals, text_html
+from nerif.app.mask_editor import MaskCard
 from nerif.app.project import Contents
 from nerif.app.view_maps import maps_html
 from nerif.app.workspace import Workspace
@@ -33,56 +32,51 @@ class DisplacementPage:
     Parameters
     ----------
     work : Workspace
-    contents : of the project
+    contents : files of the project
     """
 
     def __init__(self, work: Workspace, contents: Contents) -> None:
-        self.work, memory = work, work.draft(PAGE.name)
-        self.measured: MeasurementCard | None = None
+        self.work, draft = work, work.draft(PAGE.name)
+        self.measurement_card: MeasurementCard | None = None
         if contents.experiments and contents.calibrations:
             with ui.element("div").classes("columns"):
                 with card("Images to displacements"), ui.element("div").classes("form"):
-                    self.experiment = self._select("Experiment", contents.experiments, memory.get("experiment"))
-                    self.calibration = self._select("Calibration", contents.calibrations, memory.get("calibration"))
+                    self.experiment = select("Experiment", list(contents.experiments), draft.get("experiment"))
+                    calibrations = list(contents.calibrations)
+                    self.calibration = select("Calibration", calibrations, draft.get("calibration"))
                     self.out = ui.input("Measurement to write", value=work.project.free_name("measurement.nc"))
                     self.out.props('outlined dense aria-label="Measurement to write"')
                     record = Displacement(Path("."), Path("."), Path("measurement.nc"))
                     form = Form(record, without=BY_PAGE)
                     self.job = JobForm(
                         work, f"{PAGE.name}.run", form, self._words, "Find all displacements", MAIN,
-                        lambda: str(self.out.value), offer=self._go_on,
+                        lambda: str(self.out.value), on_continue=self._on_continue,
                     )  # fmt: skip
                     for control in (self.experiment, self.calibration, self.out):
-                        control.on_value_change(self._turned)
+                        control.on_value_change(self._on_choice)
                 with card("Preview of one view", "With these settings, before all views are done."):
-                    self.view = ui.select([], label="View").props('outlined dense options-dense aria-label="View"')
-                    self.view.classes("short")
+                    self.view = select("View", []).classes("short")
                     self.button = ui.button("Preview", icon="visibility", on_click=self.preview)
                     self.button.props("outline no-caps")
                     self.display = ui.element("div").props('aria-live="polite"')
             self._views()
         else:
-            lacking = "are no images of an experiment" if not contents.experiments else "is no calibration"
-            text_html(f"There {lacking} in the folder yet; the pages before this one help.", classes="status")
+            gap = "are no images of an experiment" if not contents.experiments else "is no calibration"
+            text_html(f"There {gap} in the folder yet; the pages before this one help.", classes="status")
         self.below = ui.element("div").classes("stack")
         self._show(contents.measurements)
 
     def _show(self, measurements: Sequence[str]) -> None:
-        if measurements and self.measured is None:
+        if measurements and self.measurement_card is None:
             with self.below:
-                self.measured = MeasurementCard(self.work, measurements)
+                self.measurement_card = MeasurementCard(self.work, measurements)
 
-    async def _go_on(self, file: str) -> None:
+    async def _on_continue(self, file: str) -> None:
         """Show a measurement that a run has written, and give the next one a new name."""
-        self._show((await self.work.beside(self.work.project.contents)).measurements)
-        if self.measured is not None:
-            await self.measured.choice.choose(file)
+        self._show(await self.work.measurements())
+        if self.measurement_card is not None:
+            await self.measurement_card.choice.choose(file)
         self.out.set_value(self.work.project.free_name("measurement.nc"))
-
-    def _select(self, label: str, names: Sequence[str], memory: object) -> ui.select:
-        control = ui.select(list(names), label=label, value=memory if memory in names else names[0])
-        control.props["aria-label"] = label
-        return control.props("outlined dense options-dense")
 
     def _words(self) -> list[str]:
         return [
@@ -90,7 +84,7 @@ class DisplacementPage:
             "--out", str(self.out.value),
         ]  # fmt: skip
 
-    def _turned(self) -> None:
+    def _on_choice(self) -> None:
         selection = {"experiment": self.experiment.value, "calibration": self.calibration.value}
         self.work.keep(PAGE.name, {**self.work.draft(PAGE.name), **selection})
         self.job.show()
@@ -104,13 +98,11 @@ class DisplacementPage:
 
     async def preview(self) -> None:
         """Find the displacements of one view and show them."""
-        self.button.disable()
-        self.display.clear()
-        with self.display:
-            ui.spinner(size="lg").props('aria-label="Working"')
         lines: list[str] = []
         html = ""
-        with refusals(lines.append):
+        with work_in_progress(self.button, self.display), refusals(lines.append):
+            with self.display:
+                ui.spinner(size="lg").props('aria-label="Working"')
             request = replace(
                 self.job.view.record(), folder=self.work.project.path(str(self.experiment.value)),
                 calibration=self.work.project.path(str(self.calibration.value)), views=(str(self.view.value),),
@@ -122,9 +114,7 @@ class DisplacementPage:
                 measurement, _ = measure_instant(request.recording(), numbers, lines.append, processes=1)
                 return maps_html(measurement)
 
-            html = await self.work.beside(work)
-        self.button.enable()
-        self.display.clear()
+            html = await self.work.in_thread(work)
         with self.display:
             for text in lines:
                 text_html(text, classes="status")
@@ -132,20 +122,20 @@ class DisplacementPage:
 
 
 class MeasurementCard:
-    """What a measurement holds, and masks drawn into it.
+    """Maps of the views of a measurement, and the editor of its masks.
 
     Parameters
     ----------
     work : Workspace
-    measurements : their names
+    measurements : names of the measurements
     """
 
     def __init__(self, work: Workspace, measurements: Sequence[str]) -> None:
         self.work = work
-        memory = work.draft(PAGE.name).get("measurement")
+        name = work.draft(PAGE.name).get("measurement")
         with card("What was measured"):
-            first = memory if memory in measurements else measurements[-1]
-            self.choice = FileChoice("Measurement", measurements, first, self._there, self._turned)
+            first = name if name in measurements else measurements[-1]
+            self.choice = FileChoice("Measurement", measurements, first, work.measurements, self._on_choice)
             self.choice.select.classes("short")
             self.fold = ui.expansion("Maps of all views", icon="grid_view", on_value_change=self._maps).classes("wide")
             with self.fold:
@@ -156,35 +146,32 @@ class MeasurementCard:
 
     @property
     def name(self) -> str:
-        """Of the measurement that is chosen."""
+        """Name of the selected measurement."""
         return self.choice.name
 
-    async def _there(self) -> Sequence[str]:
-        return (await self.work.beside(self.work.project.contents)).measurements
-
     def _read(self, name: str) -> Measurement:
-        return self.work.project.cached(name, "measurement", Measurement.read)
+        return self.work.project.from_cache(name, "measurement", Measurement.read)
 
-    async def _turned(self) -> None:
+    async def _on_choice(self) -> None:
         self.work.keep(PAGE.name, {**self.work.draft(PAGE.name), "measurement": self.name})
         self.maps.clear()
         await self._maps()
         await self._masks()
 
     async def _measurement(self) -> tuple[str, Measurement] | None:
-        """Read what is chosen; None if another one has been chosen meanwhile."""
+        """Read the selected measurement; None if another one has been selected meanwhile."""
         name = self.name
-        measurement = await self.work.beside(self._read, name)
+        measurement = await self.work.in_thread(self._read, name)
         return (name, measurement) if name == self.name else None
 
     async def _maps(self) -> None:
-        """Show the maps that are requested and not computed yet."""
+        """Show the maps unless they are folded or shown already."""
         if not self.fold.value or list(self.maps):
             return
         with refusals():
             if (selection := await self._measurement()) is None:
                 return
-            html = await self.work.beside(maps_html, selection[1])
+            html = await self.work.in_thread(maps_html, selection[1])
             if selection[0] != self.name:
                 return
             self.maps.clear()
@@ -203,7 +190,7 @@ class MeasurementCard:
 
 async def build(work: Workspace) -> None:
     """Build the page."""
-    DisplacementPage(work, await work.beside(work.project.contents))
+    DisplacementPage(work, await work.contents())
 
 
 PAGE = Page("displacement", "Displacement", "/displacement", "How far the background is shifted, view by view.", build)

@@ -8,268 +8,177 @@ from typing import Any
 
 from nicegui import ui
 
-from nerif.app.blink import Blink
-from nerif.app.crop_editor import CropEditor
-from nerif.app.crop_edits import CropEdits
-from nerif.app.histogram import histogram
-from nerif.app.pages.page import Page
-from nerif.app.pieces import CommandLine, card, refusals, text_html
+from nerif.app.crop_editor import SOURCES, CropCard
+from nerif.app.elements import CommandLine, card, items_html, refusals, select, text_html
+from nerif.app.frame import Page
 from nerif.app.workspace import Workspace
 from nerif.common.conventions import InputError
 from nerif.imaging.image_quality import ImageQuality
-from nerif.imaging.readers.crop import Crop
-from nerif.imaging.readers.views import View, write_crops
+from nerif.imaging.readers.views import View
 
 __all__ = ["PAGE"]
 
-SOURCES = ("reference", "flow")
-THUMBNAIL, LARGE = 280, 900  # px
-MOST = 12  # images of a source that are read at first
+THUMBNAIL = 280  # px
 LAYOUT = "Put images into folders such as run1/cam1/reference and run1/cam1/flow, or name them in run1/views.toml."
+WIDTH, HEIGHT = 320, 64  # of a histogram, units of the drawing
 
 
 class ImagesPage:
     """The page in one tab."""
 
     def __init__(self, work: Workspace, experiments: Sequence[str]) -> None:
-        self.work, self.experiments, self.files = work, experiments, work.files
-        memory = work.draft(PAGE.name)
-        available = str(memory.get("experiment", ""))
-        self.experiment = available if available in experiments else experiments[0]
-        self.selection, self.memory, self.most = str(memory.get("view", "")), dict(memory.get("edits", {})), MOST
+        self.work, draft = work, work.draft(PAGE.name)
+        self.drafts: dict[str, Any] = dict(draft.get("edits", {}))  # of the crops, by experiment
         self.views: dict[str, View] = {}
-        self.turn, self.closer_turn = 0, 0  # of building, and of showing a view large
-        self.first: dict[str, int] = {}
-        self.editor: CropEditor | None = None
+        self._request = 0
         with ui.element("div").classes("stack"):
             with card("Folder of images"):
-                select = ui.select(list(experiments), label="Experiment", value=self.experiment)
-                select.props('outlined dense options-dense aria-label="Experiment"').classes("short")
+                choice = select("Experiment", list(experiments), draft.get("experiment")).classes("short")
                 self.summary = ui.element("div")
                 text_html("The next step on the command line", "h3")
                 self.command = CommandLine()
             with card("Views", "The first good image of each, its grey values, and what cannot be used."):
                 self.grid = ui.element("div").classes("views")
-            self.closer = ui.element("div")
+            self.crop = CropCard(work, self._keep, self._on_save)
+        self.experiment = str(choice.value)
 
-        async def turned() -> None:
-            self.experiment, self.selection = select.value, ""
+        async def on_change() -> None:
+            self.experiment = str(choice.value)
             await self.build()
 
-        select.on_value_change(turned)
+        choice.on_value_change(on_change)
 
-    async def build(self) -> None:
-        """Build everything for the experiment that is chosen; images come one after the other."""
-        self.turn += 1
-        turn = self.turn
+    async def build(self, view: str = "") -> None:
+        """Build everything for the selected experiment, with a view in large; images come one after the other."""
+        self._request += 1
+        request = self._request
         with refusals():
-            outcome = await self.work.beside(self.work.project.views, self.experiment)
-            self.views = {view.name: view for view in outcome}
-        written = {name: view.crop or Crop() for name, view in self.views.items()}
-        self.edits = CropEdits(written, self.memory.get(self.experiment))
-        if self.selection not in self.views:
-            self.selection = next(iter(self.views), "")
-        self.keep()
+            views = await self.work.in_thread(self.work.project.views, self.experiment)
+            self.views = {view.name: view for view in views}
+        self.crop.load(self.experiment, self.views, self.drafts.get(self.experiment, {}), view)
+        self._keep()
         out = self.work.project.free_name("measurement.nc")
         self.command.show(["displacement", self.experiment, "--calibration", "calibration.toml", "-o", out])
         self.grid.clear()
         with self.grid:
             self.cells = {name: ui.element("article").classes("view") for name in self.views}
-        wrong: list[str] = []
-        await self._closer()
-        for view in list(self.views.values()):
-            wrong += await self._cell(view, turn)
-            if turn != self.turn:  # another experiment has been chosen meanwhile
+        problems: list[str] = []
+        await self.crop.show()
+        for one in list(self.views.values()):
+            problems += await self._cell(one, request)
+            if request != self._request:  # another experiment has been selected meanwhile
                 return
-            self._sum_up(wrong)
-        self._sum_up(wrong)
+            self._show_summary(problems)
+        self._show_summary(problems)
 
-    def keep(self) -> None:
-        """Keep what is chosen and edited over a reload."""
-        self.memory[self.experiment] = self.edits.draft
-        self.work.keep(PAGE.name, {"experiment": self.experiment, "view": self.selection, "edits": self.memory})
+    def _keep(self) -> None:
+        """Store selection and edits in the draft."""
+        self.drafts[self.crop.experiment] = self.crop.edits.draft
+        draft = {"experiment": self.crop.experiment, "view": self.crop.selection, "edits": self.drafts}
+        self.work.keep(PAGE.name, draft)
 
-    def _sum_up(self, wrong: Sequence[str]) -> None:
-        lines = "".join(f"<li>{escape(text)}</li>" for text in wrong)
-        listed = f"<ul class=notes aria-label='What is wrong'>{lines}</ul>" if lines else ""
-        messages = f"<p class=status>{len(self.views)} views. {'' if wrong else 'No problems found.'}</p>"
+    async def _on_save(self) -> None:
+        self.drafts[self.crop.experiment] = {**self.crop.edits.draft, "now": {}}
+        await self.build(self.crop.selection)
+
+    def _show_summary(self, problems: Sequence[str]) -> None:
         self.summary.clear()
         with self.summary:
-            ui.html(messages + listed, sanitize=False)
+            text_html(f"{len(self.views)} views. {'' if problems else 'No problems found.'}", classes="status")
+            ui.html(items_html(problems, label="What is wrong"), sanitize=False)
 
-    # -- a view in the grid --------------------------------------------------------------------------------------
-
-    async def _cell(self, view: View, turn: int) -> list[str]:
-        """Fill the cell of a view; returns what is wrong with it."""
-        wrong: list[str] = []
-        looks: dict[str, ImageQuality] = {}
+    async def _cell(self, view: View, request: int) -> list[str]:
+        """Fill the cell of a view and return its problems."""
+        problems: list[str] = []
+        qualities: dict[str, ImageQuality] = {}
         for source in SOURCES:
             try:
-                looks[source] = await self.work.beside(self.files.look, view, source, self.most)
+                qualities[source] = await self.work.in_thread(self.work.files.quality, view, source)
             except InputError as error:
-                wrong.append(str(error))
-        wrong += [f"{name}: {why}" for look in looks.values() for name, why in look.bad]
-        wrong += [note for look in looks.values() for note in look.notes]
+                problems.append(str(error))
+        problems += [f"{name}: {why}" for quality in qualities.values() for name, why in quality.bad]
+        problems += [note for quality in qualities.values() for note in quality.notes]
         images: dict[str, str] = {}
-        for source, look in looks.items():
-            with refusals(wrong.append):
-                images[source] = await self.work.beside(
-                    self.files.image, view, source, look.first, THUMBNAIL, view.crop
+        for source, quality in qualities.items():
+            with refusals(problems.append):
+                images[source] = await self.work.in_thread(
+                    self.work.files.image, view, source, quality.first, THUMBNAIL, view.crop
                 )
-        if turn != self.turn:
-            return wrong
+        if request != self._request:
+            return problems
         cell = self.cells[view.name]
         cell.clear()
         with cell:
             text_html(view.name, "h3")
             with ui.element("div").classes("pair"):
                 for source in SOURCES:
-                    _figure(view, source, looks.get(source), images.get(source, ""))
-            if wrong:
-                lines = "".join(f"<li>{escape(text)}</li>" for text in wrong)
-                ui.html(f"<ul class=notes>{lines}</ul>", sanitize=False)
+                    _figure(view, source, qualities.get(source), images.get(source, ""))
+            ui.html(items_html(problems), sanitize=False)
 
             async def choose() -> None:
-                self.selection = view.name
-                self.keep()
-                await self._closer()
-                ui.run_javascript("document.querySelector('.closer')?.scrollIntoView({block: 'start'})")
+                self.crop.selection = view.name
+                self._keep()
+                await self.crop.show()
+                ui.run_javascript("document.querySelector('.crop-card')?.scrollIntoView({block: 'start'})")
 
             button = ui.button("Look closer, crop, turn", icon="crop_rotate", on_click=choose)
             button.props("outline no-caps dense").props["aria-label"] = f"Look closer at {view.name}, crop or turn it"
-        return wrong
-
-    # -- a single view ----------------------------------------------------------------------------------------
-
-    async def _closer(self) -> None:
-        """Show the chosen view large, with what it is cropped to."""
-        self.closer_turn += 1
-        turn, view = self.closer_turn, self.views.get(self.selection)
-        self.closer.clear()
-        self.editor = None
-        if view is None:
-            return
-        messages: list[str] = []
-        first: dict[str, int] = {}
-        frame, address = (0, 0), ""
-        for source in SOURCES:
-            with refusals(messages.append):
-                look = await self.work.beside(self.files.look, view, source, self.most)
-                first[source] = look.first
-                if not address:
-                    address = await self.work.beside(self.files.image, view, source, look.first, LARGE, None)
-                    frame = look.frame_shape
-        if turn != self.closer_turn:  # another view has been chosen meanwhile
-            return
-        self.first = first
-        with self.closer, card(view.name, "Drag over the whole frame to crop it, or type; the result is on the right."):
-            self.closer.classes("closer")
-            if not address:
-                text_html("There is no image to show: " + " ".join(messages), classes="note")
-                return
-            with ui.element("div").classes("halves wide"):
-                with ui.element("div"):
-                    text_html("Whole frame", "h3")
-                    self.editor = CropEditor(view.name, frame, self.edits.now[view.name], address, self._edited)
-                with ui.element("div"):
-                    text_html("Reference and flow as they are used", "h3")
-                    self.blink = Blink(view.name)
-            self._buttons()
-        await self._show_result()
-
-    def _buttons(self) -> None:
-        with ui.element("div").classes("side-by-side"):
-            self.undo = ui.button("Undo", icon="undo", on_click=lambda: self._step(self.edits.undo))
-            self.redo = ui.button("Redo", icon="redo", on_click=lambda: self._step(self.edits.redo))
-            ui.button("Whole frame", icon="crop_free", on_click=self._whole).props("outline no-caps")
-            ui.button("The same for all views", icon="content_copy", on_click=self._for_all).props("outline no-caps")
-            self.save = ui.button("Save to views.toml", icon="save", on_click=self._save).props("unelevated no-caps")
-        for button in (self.undo, self.redo):
-            button.props("outline no-caps")
-        self.state = ui.html("", sanitize=False)
-
-    async def _edited(self, crop: Crop) -> None:
-        self.edits.put(self.selection, crop)
-        await self._show_result()
-
-    async def _whole(self) -> None:
-        await self._edited(Crop())
-        if self.editor:
-            self.editor.put(Crop())
-
-    async def _for_all(self) -> None:
-        for name in self.views:
-            self.edits.put(name, self.edits.now[self.selection])
-        await self._show_result()
-
-    async def _step(self, step: Any) -> None:
-        name = step()
-        if name and name != self.selection:
-            self.selection = name
-            await self._closer()
-            return
-        if name and self.editor:
-            self.editor.put(self.edits.now[name])
-        await self._show_result()
-
-    async def _show_result(self) -> None:
-        """Show what the crop leaves of the images, and what is not yet in the folder."""
-        self.keep()
-        view, crop = self.views[self.selection], self.edits.now[self.selection]
-        changed = self.edits.changed
-        self.undo.set_enabled(bool(self.edits.past))
-        self.redo.set_enabled(bool(self.edits.future))
-        self.save.set_enabled(bool(changed))
-        where = f"{self.experiment}/views.toml"
-        text = f"{where} is not written yet for {', '.join(changed)}: nerif displacement does not know it before."
-        done = "The commands see the views as they are shown here."
-        self.state.set_content(f"<p class=note role=status>{escape(text if changed else done)}</p>")
-        display: dict[str, str] = {}
-        for source, first in self.first.items():
-            with refusals():
-                display[source] = await self.work.beside(self.files.image, view, source, first, LARGE, crop)
-        if display and (view, crop) == (self.views.get(self.selection), self.edits.now.get(self.selection)):
-            one = next(iter(display.values()))
-            self.blink.show(display.get("reference", one), display.get("flow", one))
-
-    async def _save(self) -> None:
-        with refusals():
-            folder = self.work.project.path(self.experiment)
-            await self.work.beside(write_crops, folder, self.edits.changed)
-            self.memory[self.experiment] = {**self.edits.draft, "now": {}}
-            ui.notify(f"{self.experiment}/views.toml is written.", type="positive")
-            await self.build()
+        return problems
 
 
-def _figure(view: View, source: str, look: ImageQuality | None, address: str) -> None:
+def _figure(view: View, source: str, quality: ImageQuality | None, address: str) -> None:
     """An image, its grey values, and its figures."""
-    if look is None or not address:
+    if quality is None or not address:
         text_html(f"No {source} image", classes="missing note")
         return
-    height, width = look.shape
+    height, width = quality.shape
     with ui.element("figure"):
         image = ui.element("img").props("loading=lazy")
         image.props["src"], image.props["alt"] = address, f"{source.capitalize()} of {view.name}"
-        visible = f"{look.count}" if look.sampled == look.count else f"{look.count} ({look.sampled} read)"
-        full = f"{look.saturated:.2%} saturated" if look.full > 1 else "saturation unknown"
+        count = f"{quality.count}" if quality.sampled == quality.count else f"{quality.count} ({quality.sampled} read)"
+        full = f"{quality.saturated:.2%} saturated" if quality.full > 1 else "saturation unknown"
         label = f"Grey values of {source} of {view.name}, {full}"
         ui.html(
-            f"<figcaption><b>{source.capitalize()}</b>, {visible}<br>{width} × {height} px, "
+            f"<figcaption><b>{source.capitalize()}</b>, {count}<br>{width} × {height} px, "
             f"<span class=share>{full}</span></figcaption>"
-            + histogram(look.histogram.tolist(), look.full, escape(label)), sanitize=False,
+            + _histogram(quality.histogram.tolist(), quality.full, escape(label)), sanitize=False,
         )  # fmt: skip
+
+
+def _histogram(shares: Sequence[float], full: float, label: str) -> str:
+    """Return the histogram as HTML; full scale is at the right end.
+
+    Parameters
+    ----------
+    shares : fraction of the pixels per bin, from 0 to full scale
+    full : grey value at full scale
+    label : description for screen readers, escaped
+    """
+    most = max(shares) or 1.0
+    step = WIDTH / len(shares)
+    bars = "".join(
+        f"<rect x='{i * step:.2f}' y='{HEIGHT * (1 - share / most):.2f}' width='{step:.2f}' "
+        f"height='{HEIGHT * share / most:.2f}'/>"
+        for i, share in enumerate(shares)
+        if share > 0
+    )
+    return (
+        f"<figure class=histogram><svg viewBox='0 0 {WIDTH} {HEIGHT}' preserveAspectRatio=none role=img "
+        f'aria-label="{label}">{bars}</svg><figcaption><span>0</span><span>grey value</span><span>{full:g}</span>'
+        "</figcaption></figure>"
+    )
 
 
 async def build(work: Workspace) -> None:
     """Build the page."""
-    outcome = await work.beside(work.project.contents)
-    if not outcome.experiments:
+    experiments = (await work.contents()).experiments
+    if not experiments:
         with card("In this folder"):
             text_html("There are no images in this folder yet. " + LAYOUT, classes="note")
         return
-    page = ImagesPage(work, outcome.experiments)
+    page, view = ImagesPage(work, experiments), str(work.draft(PAGE.name).get("view", ""))
     with ui.element("div"):
-        ui.timer(0.01, page.build, once=True)  # the page is there before its images are read
+        ui.timer(0.01, lambda: page.build(view), once=True)  # the page is there before its images are read
 
 
 ABOUT = "What is in the folder, whether it can be used, and which part of the frames is each view's own."

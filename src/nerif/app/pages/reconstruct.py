@@ -11,12 +11,11 @@ from typing import Any
 import tyro
 from nicegui import ui
 
-from nerif.app.file_choice import FileChoice
+from nerif.app.elements import CommandLine, FileChoice, card, refusals, select, text_html
 from nerif.app.form_view import FormView
 from nerif.app.forms import Form
+from nerif.app.frame import Page
 from nerif.app.live_view import LiveView
-from nerif.app.pages.page import Page
-from nerif.app.pieces import CommandLine, card, refusals, text_html
 from nerif.app.workspace import Workspace
 from nerif.cli.commands.reconstruct import Reconstruct, command_of
 from nerif.cli.commands.sequence import Sequence
@@ -30,7 +29,7 @@ __all__ = ["PAGE"]
 WITHOUT = ("config", "measurement", "out", "method", "preset", "force", "resume", "live")
 MAIN = ("time_limit", "withhold", "uncertainty", "voxels")
 FILM = ".zarr"
-VALUES = {False: "values", True: "film_values"}  # of what is not a film, and of one
+VALUES = {False: "values", True: "film_values"}  # key of the settings in the draft: of one instant, of a film
 FILM_WITHOUT = ("config", "measurement", "out", "preset", "force", "time_limit", "refine")
 FILM_MAIN = ("cluster", "workers", "chunk", "withhold", "voxels")
 
@@ -59,20 +58,21 @@ class ReconstructPage:
 
     def __init__(self, work: Workspace, measurements: Iterable[str]) -> None:
         self.work = work
-        memory = work.draft(PAGE.name)
-        self.measurements = tuple(measurements)
-        available = memory.get("measurement")
-        self.values: dict[str, dict[str, Any]] = {name: dict(memory.get(name, {})) for name in VALUES.values()}
+        draft = work.draft(PAGE.name)
+        name = draft.get("measurement")
+        self.values: dict[str, dict[str, Any]] = {name: dict(draft.get(name, {})) for name in VALUES.values()}
         with ui.element("div").classes("columns"):
             with card("A run"), ui.element("div").classes("form"):
                 text = "No measurement in this folder yet: nerif displacement or nerif simulate makes one."
                 note = text_html(text, classes="note")
-                self.measurement = FileChoice("Measurement", self.measurements, available, self._there, self._chosen)
+                self.measurement = FileChoice(
+                    "Measurement", tuple(measurements), name, lambda: _measurements(work), self._on_choice
+                )
                 note.bind_visibility_from(self.measurement.select, "options", lambda names: not names)
-                self.method = self._select("Method", titles(), memory.get("method", "nerif"))
+                self.method = self._select("Method", titles(), draft.get("method", "nerif"))
                 self.about = ui.html("", sanitize=False).classes("help")
-                self.preset = self._select("Preset", ["auto", *PRESETS], memory.get("preset", "auto"))
-                self.out = ui.input("Result directory", value=self._free()).props("outlined dense debounce=250")
+                self.preset = self._select("Preset", ["auto", *PRESETS], draft.get("preset", "auto"))
+                self.out = ui.input("Result directory", value=self._free_name()).props("outlined dense debounce=250")
                 self.out.on_value_change(self._show)
                 self.place = ui.element("div").classes("form")
                 self.start = ui.button("Start", icon="play_arrow", on_click=self._start).props("unelevated no-caps")
@@ -83,24 +83,19 @@ class ReconstructPage:
         self._build_form()
 
     def _select(self, label: str, options: Any, value: Any) -> ui.select:
-        select = ui.select(options, label=label, value=value)
-        select.props(f'outlined dense options-dense aria-label="{label}"')
-        return select.on_value_change(self._chosen)
+        return select(label, options, value).on_value_change(self._on_choice)
 
-    def _chosen(self) -> None:
+    def _on_choice(self) -> None:
         if hasattr(self, "live"):
-            self.out.set_value(self._free())
+            self.out.set_value(self._free_name())
             self._build_form()
-
-    async def _there(self) -> tuple[str, ...]:
-        return await _measurements(self.work)
 
     @property
     def film(self) -> bool:
-        """Whether what is chosen has many instants."""
+        """Whether the selected measurement is a film."""
         return self.measurement.name.endswith(FILM)
 
-    def _free(self) -> str:
+    def _free_name(self) -> str:
         stem = PurePosixPath(self.measurement.name or "run").stem
         occupied = [job.out for job in self.work.jobs.all()]
         ending = FILM if self.film else f"-{self.method.value}"
@@ -127,19 +122,16 @@ class ReconstructPage:
         """Return the arguments of nerif that the page is set to."""
         verb = "sequence" if self.film else "reconstruct"
         words = [verb, self.measurement.name or "MEASUREMENT.nc", "--out", self.out.value or "OUT"]
-        if self.film:
-            selection = ["--preset", self.preset.value] if self.preset.value != "auto" else []
-            return [*words, *selection, *self.view.arguments]
-        if self.method.value != "nerif":
+        if not self.film and self.method.value != "nerif":
             words += ["--method", self.method.value]
         elif self.preset.value != "auto":
             words += ["--preset", self.preset.value]
-        return [*words, *self.view.arguments, "--live"]
+        return [*words, *self.view.arguments, *([] if self.film else ["--live"])]
 
     def _show(self) -> None:
         self.values[VALUES[self.film]] = dict(self.view.values)
-        memory = {"measurement": self.measurement.name, "method": self.method.value, "preset": self.preset.value}
-        self.work.keep(PAGE.name, {**memory, **self.values})
+        draft = {"measurement": self.measurement.name, "method": self.method.value, "preset": self.preset.value}
+        self.work.keep(PAGE.name, {**draft, **self.values})
         self.command.show(self.arguments())
         self.start.set_enabled(bool(self.measurement.name and self.out.value) and self.view.valid)
 
@@ -150,7 +142,7 @@ class ReconstructPage:
             out = self.work.project.relative(self.out.value)
             job = self.work.jobs.add(self.arguments(), f"{self.measurement.name} → {out}", out)
             (self.work.project.folder / out).parent.mkdir(parents=True, exist_ok=True)
-            self.out.set_value(self._free())
+            self.out.set_value(self._free_name())
             self.live.follow(job.id)
 
 
@@ -161,12 +153,12 @@ async def build(work: Workspace) -> None:
 
 async def _measurements(work: Workspace) -> tuple[str, ...]:
     """What can be reconstructed: measurements, and films of them."""
-    result = await work.beside(work.project.contents)
-    films = [name for name in result.films if await work.beside(_measured, work, name)]
+    result = await work.contents()
+    films = [name for name in result.films if await work.in_thread(_has_measurements, work, name)]
     return (*result.measurements, *films)
 
 
-def _measured(work: Workspace, name: str) -> bool:
+def _has_measurements(work: Workspace, name: str) -> bool:
     """Whether a store over time holds measurements."""
 
     def read(path: Path) -> bool:
@@ -176,7 +168,7 @@ def _measured(work: Workspace, name: str) -> bool:
             return False
 
     try:
-        return work.project.cached(f"{name}/zarr.json", "measured", read)
+        return work.project.from_cache(f"{name}/zarr.json", "measured", read)
     except FileNotFoundError:  # just being made, or none of ours
         return False
 

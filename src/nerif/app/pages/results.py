@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import PurePosixPath
 from typing import Any
 
 import tyro
 from nicegui import ui
 
+from nerif.app.elements import CommandLine, card, figures, refusals, select, text_html
 from nerif.app.forms import Form
-from nerif.app.job_form import JobForm
-from nerif.app.job_status import JobStatus
+from nerif.app.frame import Page
+from nerif.app.job_form import JobForm, JobStatus
 from nerif.app.jobs import Job
-from nerif.app.pages.page import Page
-from nerif.app.pieces import CommandLine, card, figures, refusals, text_html
-from nerif.app.result_answers import report_address, report_file
-from nerif.app.result_look import ResultLook
 from nerif.app.result_table import Row, result_table, rows_of
+from nerif.app.result_view import ResultView
+from nerif.app.routes import report_address, report_file
 from nerif.app.workspace import Workspace
 from nerif.cli.commands.export import Export
 from nerif.cli.commands.figures import Figures
@@ -50,7 +49,7 @@ class ResultsPage:
         return next((row for row in self.rows if row.name == self.draft.get("result")), self.rows[0])
 
     def keep(self) -> None:
-        """Keep what is chosen over a reload."""
+        """Store the choices in the draft."""
         self.work.keep(PAGE.name, self.draft)
 
     async def choose(self, name: str) -> None:
@@ -59,7 +58,7 @@ class ResultsPage:
         await self.build()
 
     async def build(self) -> None:
-        """Build everything for the result that is chosen."""
+        """Build everything for the selected result."""
         self.keep()
         self.table.clear()
         self.place.clear()
@@ -81,17 +80,17 @@ class ResultsPage:
                 ui.html(figures([(a, b, "") for a, b in row.figures]), sanitize=False)
 
     async def _views(self) -> None:
-        memory = str(self.draft.get("tab", "slices"))
+        tab = str(self.draft.get("tab", "slices"))
         with ui.element("section").classes("card").props('aria-label="The result"'):
             with ui.tabs().props("no-caps align=left dense") as tabs:
                 for name, title in TABS.items():
                     ui.tab(name, title)
             others = [r.name for r in self.rows if r.name != self.row.name and r.film == self.row.film]
-            look = ResultLook(self.work, self.row.name, others, self.draft, self.keep)
-            first = memory if memory in TABS else "slices"
+            view = ResultView(self.work, self.row.name, others, self.draft, self.keep)
+            first = tab if tab in TABS else "slices"
             with ui.tab_panels(tabs, value=first, animated=False).classes("panels-of-tabs") as panels:
                 with ui.tab_panel("slices"):
-                    await look.build()
+                    await view.build()
                 with ui.tab_panel("surface"):
                     surface = ui.element("div").classes("stack")
                 with ui.tab_panel("report"):
@@ -99,17 +98,17 @@ class ResultsPage:
                 with ui.tab_panel("export"):
                     self._export()
 
-        async def turned() -> None:
+        async def on_change() -> None:
             self.draft["tab"] = panels.value
             self.keep()
-            if panels.value == "surface":  # of what is chosen in the slices
+            if panels.value == "surface":  # of the quantity in the slices
                 surface.clear()
                 with surface, refusals():
-                    await look.surfaces()
+                    await view.surfaces()
 
-        panels.on_value_change(turned)
+        panels.on_value_change(on_change)
         if panels.value == "surface":
-            await turned()
+            await on_change()
 
     # -- report --------------------------------------------------------------------------------------------------
 
@@ -131,15 +130,15 @@ class ResultsPage:
 
         def write() -> None:
             with refusals():
-                writing.follow(self.work.jobs.add(["report", name], f"Report {name}"))
+                status.follow(self.work.jobs.add(["report", name], f"Report {name}"))
 
-        async def written(job: Job) -> None:
+        async def on_end(job: Job) -> None:
             if job.state == "done":
                 await self.build()
 
         button = "Write it again" if file.is_file() else "Write the report"
         ui.button(button, icon="playlist_add", on_click=write).props("outline no-caps")
-        writing = JobStatus(self.work, f"{PAGE.name}.report {name}", written)
+        status = JobStatus(self.work, f"{PAGE.name}.report {name}", on_end)
 
     # -- for others ----------------------------------------------------------------------------------------------
 
@@ -154,29 +153,30 @@ class ResultsPage:
             with card("Figures for print", "Vector PDF and PNG, as wide as the columns of a journal."):
                 self._figures()
 
-    def _free(self, ending: str) -> str:
-        return self.work.project.free_name(f"exports/{PurePosixPath(self.row.name).stem}{ending}")
+    def _file_form(
+        self, verb: str, form: Form[Any], formats: Mapping[str, str], button: str, main: Sequence[str]
+    ) -> None:
+        """Build the form of a command that writes a file, with a choice of its format that changes its name."""
 
-    def _named(self, label: str, options: dict[str, str]) -> tuple[ui.select, ui.input]:
-        """A choice of formats and the name of the file, which follows it."""
-        first = next(iter(options))
-        choice = ui.select(options, label=label, value=first).props("outlined dense options-dense")
-        choice.props["aria-label"] = label
-        name = ui.input("File to write", value=self._free(first)).props("outlined dense debounce=250")
-        name.props["aria-label"] = "File to write"
-        choice.on_value_change(lambda: name.set_value(self._free(choice.value)))
-        return choice, name
+        def name_with(ending: str) -> str:
+            return self.work.project.free_name(f"exports/{PurePosixPath(self.row.name).stem}{ending}")
+
+        first = next(iter(formats))
+        with ui.element("div").classes("form"):
+            choice = select("Format", dict(formats), first)
+            name = ui.input("File to write", value=name_with(first)).props("outlined dense debounce=250")
+            name.props["aria-label"] = "File to write"
+            job_form = JobForm(
+                self.work, f"{PAGE.name}.{verb}", form, lambda: [verb, self.row.name, "-o", name.value or "FILE"],
+                button, main, lambda: name.value, subject=self.row.name,
+            )  # fmt: skip
+        choice.on_value_change(lambda: name.set_value(name_with(choice.value)))
+        name.on_value_change(job_form.show)
 
     def _volume(self) -> None:
-        record = Export(tyro.MISSING, tyro.MISSING)
-        form = Form(record, without=("config", "result", "out", "force"))
-        with ui.element("div").classes("form"):
-            _, name = self._named("Format", {ending: PROGRAMS.get(ending, ending) for ending in FORMATS})
-            made = JobForm(
-                self.work, f"{PAGE.name}.export", form, lambda: ["export", self.row.name, "-o", name.value or "FILE"],
-                "Export", ("voxels", "quantities"), lambda: name.value, about=self.row.name,
-            )  # fmt: skip
-        name.on_value_change(made.show)
+        form = Form(Export(tyro.MISSING, tyro.MISSING), without=("config", "result", "out", "force"))
+        formats = {ending: PROGRAMS.get(ending, ending) for ending in FORMATS}
+        self._file_form("export", form, formats, "Export", ("voxels", "quantities"))
 
     def _figures(self) -> None:
         record = Figures(tyro.MISSING)
@@ -185,25 +185,19 @@ class ResultsPage:
             text_html(f"They are written to {self.row.name}/figures.", classes="note")
             JobForm(
                 self.work, f"{PAGE.name}.figures", form, lambda: ["figures", self.row.name], "Draw the figures",
-                about=self.row.name,
+                subject=self.row.name,
             )  # fmt: skip
 
     def _movie(self) -> None:
         record = MovieCommand(tyro.MISSING, tyro.MISSING)
         form = Form(record, without=("config", "result", "out", "force"))
-        with ui.element("div").classes("form"):
-            _, name = self._named("Format", {".mp4": "H.264 (.mp4)", ".gif": "GIF (.gif)"})
-            made = JobForm(
-                self.work, f"{PAGE.name}.movie", form, lambda: ["movie", self.row.name, "-o", name.value or "FILE"],
-                "Make the movie", ("style", "every"), lambda: name.value, about=self.row.name,
-            )  # fmt: skip
-        name.on_value_change(made.show)
+        formats = {".mp4": "H.264 (.mp4)", ".gif": "GIF (.gif)"}
+        self._file_form("movie", form, formats, "Make the movie", ("style", "every"))
 
 
 async def build(work: Workspace) -> None:
     """Build the page."""
-    outcome = await work.beside(work.project.contents)
-    page = ResultsPage(work, await work.beside(rows_of, work.project, outcome))
+    page = ResultsPage(work, await work.in_thread(rows_of, work.project, await work.contents()))
     await page.build()
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from nerif.app.pages.design import SLIDERS
-from nerif.app.scale import STEPS, Scale
+from nerif.app.sliders import STEPS, Scale
 
 
 @pytest.mark.parametrize("ends", [e for e in SLIDERS.values() if isinstance(e[0], float)])

@@ -12,11 +12,11 @@ from typing import Any
 from nicegui import ui
 
 from nerif.analysis.resampling import common_grid, difference, resampled
-from nerif.app.pieces import text_html
-from nerif.app.range_slider import RangeSlider
+from nerif.app.elements import select, text_html
+from nerif.app.result_volumes import Source, source_of
 from nerif.app.slices_view import Panel, SlicesView
-from nerif.app.sources import Source, source_of
-from nerif.app.surface_view import Surface, SurfaceView
+from nerif.app.sliders import RangeSlider
+from nerif.app.surfaces import Surface, SurfaceView
 from nerif.app.workspace import Workspace
 from nerif.common.conventions import InputError, unit_shown
 from nerif.data.volume import Volume, describe
@@ -24,14 +24,14 @@ from nerif.plotting.drawing import DIVERGING, LABELS, map_range
 from nerif.report.slice_images import colours_of
 from nerif.results.directory import VOLUME
 
-__all__ = ["ResultLook"]
+__all__ = ["ResultView"]
 
 PLAY_EVERY = 0.25  # seconds a frame
 CLOSE = 0.5 + 1e-6  # of the frame interval: largest distance in time of frames that are compared
 
 
-class ResultLook:
-    """The images of one result in one tab.
+class ResultView:
+    """The images of one result in one tab; `build` opens its source.
 
     Parameters
     ----------
@@ -46,16 +46,16 @@ class ResultLook:
         self, work: Workspace, name: str, others: Sequence[str], draft: dict[str, Any], keep: Callable[[], None]
     ) -> None:
         self.work, self.name, self.others, self.draft, self.keep = work, name, tuple(others), draft, keep
-        self.source: Source | None = None
+        self.readable = False  # whether it has a field
         self.step = 0
-        self._playing: ui.timer | None = None
+        self._timer: ui.timer | None = None
 
     # -- controls ------------------------------------------------------------------------------------------------
 
     async def build(self) -> None:
         """Build controls and images, or the reason why there are none."""
         try:
-            self.source = await self.work.beside(self._open, self.name)
+            self.source = await self.work.in_thread(self._open, self.name)
             quantities = [q for q in self.source.quantities if not q.endswith("_std")]
         except InputError as error:
             text_html(f"{error}.", classes="note")
@@ -63,17 +63,15 @@ class ResultLook:
         if not quantities:
             text_html(f"{self.name}: it contains no field.", classes="note")
             return
-        quantity = str(self.draft.get("quantity", ""))
+        self.readable = True
         options = {q: describe(q)[1].capitalize() for q in quantities}
         with ui.element("div").classes("choices"):
-            self.quantity = _select("Quantity", options, quantity if quantity in options else quantities[0])
-            against = str(self.draft.get("against", ""))
+            self.quantity = select("Quantity", options, self.draft.get("quantity"))
             choices = {"": "Nothing", **{name: name for name in self.others}}
-            self.against = _select("Compare with", choices, against if against in choices else "")
+            self.against = select("Compare with", choices, self.draft.get("against"))
             self.spread = ui.switch("Standard deviation", value=bool(self.draft.get("spread")))
         for control in (self.quantity, self.against, self.spread):
             control.on_value_change(self._update_draft)
-        self.time: RangeSlider | None = None
         if len(self.source.frames) > 1:
             self._build_time()
         self.note = ui.html("", sanitize=False).props("aria-live=polite")
@@ -82,7 +80,6 @@ class ResultLook:
 
     def _build_time(self) -> None:
         source = self.source
-        assert source is not None
 
         async def move(step: int) -> None:
             self.step = step
@@ -98,20 +95,18 @@ class ResultLook:
             self.time = RangeSlider("Time", len(source.frames) - 1, 0, text, move)
 
     def _play(self) -> None:
-        if self._playing is not None:
-            self._playing.cancel()
-            self._playing = None
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
             self.play.props("icon=play_arrow")
             return
 
         async def advance() -> None:
-            assert self.source is not None
-            assert self.time is not None
             self.step = (self.step + 1) % len(self.source.frames)
             self.time.put(self.step)
             await self.draw()
 
-        self._playing = ui.timer(PLAY_EVERY, advance)
+        self._timer = ui.timer(PLAY_EVERY, advance)
         self.play.props("icon=pause")
 
     async def _update_draft(self) -> None:
@@ -126,17 +121,15 @@ class ResultLook:
     @property
     def frame(self) -> int:
         """The current frame; 0 for a result of one instant."""
-        assert self.source is not None
         return self.source.frames[self.step]
 
     async def draw(self) -> None:
         """Draw the selected quantity at the current step."""
-        assert self.source is not None
-        available = f"{self.quantity.value}_std" in self.source.quantities
-        self.spread.set_visibility(available)
-        quantity = f"{self.quantity.value}_std" if available and self.spread.value else self.quantity.value
+        has_std = f"{self.quantity.value}_std" in self.source.quantities
+        self.spread.set_visibility(has_std)
+        quantity = f"{self.quantity.value}_std" if has_std and self.spread.value else self.quantity.value
         try:
-            panels, note = await self.work.beside(self._panels, quantity, self.against.value, self.step)
+            panels, note = await self.work.in_thread(self._panels, quantity, self.against.value, self.step)
         except InputError as error:
             panels, note = [], f"{error}."
         self.note.set_content(f"<p class=note>{escape(note)}</p>" if note else "")
@@ -148,7 +141,6 @@ class ResultLook:
     def _panels(self, quantity: str, against: str, step: int) -> tuple[list[Panel], str]:
         """The panels to draw side by side, and a note about them."""
         source = self.source
-        assert source is not None
         first, limits = source.volume(quantity, source.frames[step]), source.limits(quantity)
         unit, colours = _unit(first), colours_of(quantity)
         if not against:
@@ -156,7 +148,7 @@ class ResultLook:
         other = self._open(against)
         if quantity not in other.quantities:
             raise InputError(f"it has no {describe(quantity)[1]} to compare with", field=against)
-        second = other.volume(quantity, self._at(other, against, step))
+        second = other.volume(quantity, self._nearest_frame(other, against, step))
         other_limits = other.limits(quantity)
         limits = min(limits[0], other_limits[0]), max(limits[1], other_limits[1])
         grid = common_grid(first, second)
@@ -172,10 +164,9 @@ class ResultLook:
         shape = " × ".join(str(n) for n in grid.shape[::-1])
         return panels, f"The grids differ: both fields are interpolated trilinearly to {shape} voxels (x, y, z)."
 
-    def _at(self, other: Source, against: str, step: int) -> int:
+    def _nearest_frame(self, other: Source, against: str, step: int) -> int:
         """The frame of another source that is nearest in time to a step."""
         source = self.source
-        assert source is not None
         now = source.times[source.frames[step]]
         nearest = min(other.frames, key=lambda frame: abs(other.times[frame] - now))
         if abs(other.times[nearest] - now) > CLOSE * min(_interval(source.times), _interval(other.times)):
@@ -191,23 +182,22 @@ class ResultLook:
 
     async def surfaces(self) -> None:
         """Build the isosurface of the selected quantity."""
-        if self.source is None:
+        if not self.readable:
             text_html("There is no field to show yet.", classes="note")
             return
         quantity, against = self.quantity.value, self.against.value
-        volume, limits, level = await self.work.beside(self._volume, quantity)
+        volume, limits, level = await self.work.in_thread(self._volume, quantity)
         if min(volume.grid.shape) < 2:
             text_html("The field is a plane and has no isosurface.", classes="note")
             return
         view = SurfaceView(quantity, _unit(volume), limits, level, volume.grid.box)
         surfaces = [self._surface_of(self.name, self.frame)]
         if against:
-            other = await self.work.beside(self._open, against)
-            surfaces.append(self._surface_of(against, self._at(other, against, self.step)))
+            other = await self.work.in_thread(self._open, against)
+            surfaces.append(self._surface_of(against, self._nearest_frame(other, against, self.step)))
         view.show(surfaces)
 
     def _volume(self, quantity: str) -> tuple[Volume, tuple[float, float], float]:
-        assert self.source is not None
         volume = self.source.volume(quantity, self.frame)
         return volume, self.source.limits(quantity), self.source.level(quantity)
 
@@ -225,9 +215,3 @@ def _interval(times: Sequence[float]) -> float:
 def _unit(volume: Volume) -> str:
     """The unit for display, empty for a pure number."""
     return unit_shown(LABELS.get(volume.quantity.removesuffix("_std"), ("", volume.unit))[1])
-
-
-def _select(label: str, options: Any, value: str) -> ui.select:
-    select = ui.select(options, label=label, value=value).props("outlined dense options-dense")
-    select.props["aria-label"] = label
-    return select

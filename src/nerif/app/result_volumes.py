@@ -17,7 +17,7 @@ from nerif.report.movie import finished_frames, ranges_over_time
 from nerif.report.packing import coarsen
 from nerif.results.directory import VOLUME
 
-__all__ = ["Film", "Source", "Still", "source_of"]
+__all__ = ["Film", "Source", "Still", "film_progress", "source_of"]
 
 Limits = tuple[float, float]
 
@@ -53,7 +53,7 @@ class Still:
     @property
     def quantities(self) -> tuple[str, ...]:
         """Quantities to display: n only without its excess over ambient, standard deviations after their means."""
-        return _worth_showing(self._volumes)
+        return _display_names(self._volumes)
 
     def volume(self, quantity: str, frame: int = 0) -> Volume:
         """Return one quantity, averaged down if it is large."""
@@ -78,7 +78,7 @@ class Film:
         self.path = path
         store = VolumeSequence(path)
         self.times, self.frames = store.times, finished_frames(store)
-        self.quantities = _worth_showing(store.quantities)
+        self.quantities = _display_names(store.quantities)
         if not self.frames:
             raise InputError("no frame is complete yet", field=path.name)
 
@@ -104,7 +104,19 @@ def source_of(path: Path) -> Source:
     return Film(path) if path.suffix == ".zarr" else Still(path)
 
 
-def _worth_showing(quantities: Sequence[str] | dict[str, Volume]) -> tuple[str, ...]:
+def film_progress(path: Path) -> tuple[float, str]:
+    """Return the fraction of complete frames of a film, and the count as text; 0 and empty before there is a store."""
+    if not (path / "zarr.json").is_file():
+        return 0.0, ""
+    try:
+        store = VolumeSequence(path)
+    except InputError:  # incomplete
+        return 0.0, ""
+    done, count = len(finished_frames(store)), len(store)
+    return done / max(count, 1), f"{done} of {count} frames"
+
+
+def _display_names(quantities: Sequence[str] | dict[str, Volume]) -> tuple[str, ...]:
     names = [q for q in quantities if q.rpartition("_")[2] not in STATISTICS and (q != "n" or INDEX not in quantities)]
     return tuple(name for q in names for name in (q, f"{q}_std") if name in quantities)
 

@@ -1,0 +1,97 @@
+"""Responses of the server other than pages: reports and isosurfaces.
+
+A report may come from another machine, so it is sandboxed and cannot reach this server.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable, Mapping
+from pathlib import Path
+from urllib.parse import quote, urlencode
+
+from starlette.requests import Request
+from starlette.responses import FileResponse, PlainTextResponse, Response
+
+from nerif.app.result_volumes import source_of
+from nerif.app.workspace import Workspace
+from nerif.common.conventions import InputError
+from nerif.data.volume import Volume
+from nerif.report.isosurface import default_level, stl_of, surface_triangles
+from nerif.results.directory import REPORT
+from nerif.results.live import read_look
+
+__all__ = ["live_address", "report_address", "report_file", "routes", "surface_address"]
+
+SANDBOX = (
+    "sandbox allow-scripts allow-downloads; default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
+    "img-src data: blob:; font-src data:; frame-ancestors 'self'; base-uri 'none'; form-action 'none'"
+)
+CACHE = "private, max-age=3600"  # the address changes with the file
+
+Respond = Callable[[Workspace, Mapping[str, str]], Response]
+Handler = Callable[[Request], Awaitable[Response]]
+
+
+def report_file(path: Path) -> Path:
+    """Return the path of the report of a result directory or of a store over time."""
+    return path.with_suffix(".html") if path.suffix == ".zarr" else path / REPORT
+
+
+def report_address(name: str, stamp: int) -> str:
+    """Return the address of a report; `stamp` changes with its file."""
+    return "/report?" + urlencode({"of": name, "stamp": stamp}, quote_via=quote)
+
+
+def surface_address(name: str, quantity: str, level: float, frame: int, stamp: int) -> str:
+    """Return the address of an isosurface."""
+    query = {"of": name, "quantity": quantity, "level": repr(level), "frame": frame, "stamp": stamp}
+    return "/surface?" + urlencode(query, quote_via=quote)
+
+
+def live_address(name: str, stamp: int) -> str:
+    """Return the address of the isosurface of the last preview of a run."""
+    return "/live-surface?" + urlencode({"of": name, "stamp": stamp}, quote_via=quote)
+
+
+def _report(work: Workspace, query: Mapping[str, str]) -> Response:
+    file = work.project.path(report_file(work.project.path(query.get("of", ""))))
+    if not file.is_file():
+        raise InputError("There is no report yet: nerif report writes it.")
+    headers = {"content-security-policy": SANDBOX, "cache-control": CACHE}
+    return FileResponse(file, media_type="text/html; charset=utf-8", headers=headers)
+
+
+def _surface(work: Workspace, query: Mapping[str, str]) -> Response:
+    level, frame = float(query.get("level", "0")), int(query.get("frame", "0"))
+    volumes = source_of(work.project.path(query.get("of", "")))
+    return _stl_response(volumes.volume(query.get("quantity", ""), frame), level)
+
+
+def _live_surface(work: Workspace, query: Mapping[str, str]) -> Response:
+    look = read_look(work.project.path(query.get("of", "")))
+    if look is None:
+        raise InputError("There is no preview of the field yet.")
+    return _stl_response(look.volume, default_level(look.volume))
+
+
+def _stl_response(volume: Volume, level: float) -> Response:
+    stl = stl_of(surface_triangles(volume, level))
+    return Response(stl, media_type="model/stl", headers={"cache-control": CACHE})
+
+
+RESPONSES = {"/report": _report, "/surface": _surface, "/live-surface": _live_surface}
+
+
+def routes(work: Workspace) -> dict[str, Handler]:
+    """Return the handlers of requests by their path; they respond with 404 to invalid ones."""
+
+    def handler(respond: Respond) -> Handler:
+        async def handle(request: Request) -> Response:
+            try:
+                return await work.in_thread(respond, work, request.query_params)
+            except ValueError as error:  # also an InputError
+                return PlainTextResponse(str(error), 404)
+
+        return handle
+
+    return {path: handler(respond) for path, respond in RESPONSES.items()}

@@ -1,0 +1,205 @@
+"""Isosurfaces in a 3-D scene: of one or two volumes, and of the present field of a reconstruction in progress."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+from typing import Any
+
+import numpy as np
+from nicegui import ui
+
+from nerif.app.routes import live_address, surface_address
+from nerif.app.sliders import RangeSlider
+from nerif.common.conventions import unit_shown
+from nerif.data.volume import describe, name_of
+from nerif.geometry import Box
+from nerif.report.isosurface import default_level, surface_triangles
+from nerif.results.live import Look
+
+__all__ = ["LiveSurface", "Surface", "SurfaceView", "caption_of", "scene_of"]
+
+SIZE = 4.0  # longest edge of the box, in scene units
+LIVE_SIZE = (1080, 380)
+GROUND = "#eef1f4"
+EDGE = "#76838f"
+STEPS = 100  # of the slider
+COLOURS = (("#4aa3dd", 1.0), ("#e8853a", 0.55))  # and opacity
+
+
+def scene_of(label: str, width: int, height: int) -> ui.scene:
+    """Build an empty scene.
+
+    Parameters
+    ----------
+    label : description for screen readers
+    width, height : px
+    """
+    camera = ui.scene.perspective_camera(fov=38)
+    scene = ui.scene(width=width, height=height, grid=False, camera=camera, background_color=GROUND)
+    scene.classes("surface").props("role=img").props["aria-label"] = label
+    return scene
+
+
+class BoxScene:
+    """A box with surfaces in it, turned with the mouse; added to the page under construction.
+
+    Parameters
+    ----------
+    box : mm
+    label : description for screen readers
+    size : width and height, px
+    """
+
+    def __init__(self, box: Box, label: str, size: tuple[int, int] = (1080, 480)) -> None:
+        self.box, self._scale = box, SIZE / max(box.edges)
+        self.scene = scene_of(label, *size)
+        self.scene.move_camera(6.0, -6.9, 3.9, 0, 0, -0.3, duration=0)
+        self._edges()
+
+    def name(self, label: str) -> None:
+        """Describe the scene for screen readers."""
+        if self.scene.props.get("aria-label") != label:
+            self.scene.props["aria-label"] = label
+            self.scene.update()
+
+    def clear(self) -> None:
+        """Remove all surfaces; the box stays."""
+        self.scene.clear()
+        self._edges()
+
+    def add(self, address: str, colour: str, opacity: float = 1.0) -> Any:
+        """Add a surface, an STL file in mm, and return it; its `delete` removes it."""
+        with self.scene:
+            surface = self.scene.stl(address).material(colour, opacity, side="both").scale(self._scale)
+            return surface.move(*(-c * self._scale for c in self.box.centre))
+
+    def _edges(self) -> None:
+        lower, upper, centre = self.box.lower, self.box.upper, self.box.centre
+        corners = [
+            [((upper if i >> a & 1 else lower)[a] - centre[a]) * self._scale for a in range(3)] for i in range(8)
+        ]
+        with self.scene:
+            for i in range(8):
+                for a in range(3):
+                    if not i >> a & 1:
+                        self.scene.line(corners[i], corners[i | 1 << a]).material(EDGE)
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Source of an isosurface.
+
+    Parameters
+    ----------
+    name : result or film, relative to the project
+    frame : frame of a film
+    stamp : value that changes with the file
+    """
+
+    name: str
+    frame: int
+    stamp: int
+
+
+class SurfaceView:
+    """A scene with a slider for the level.
+
+    Parameters
+    ----------
+    quantity : name of the quantity
+    unit : unit of the level
+    limits : ends of the slider
+    level : initial level
+    box : box of the volume, mm
+    """
+
+    def __init__(self, quantity: str, unit: str, limits: tuple[float, float], level: float, box: Box) -> None:
+        self.quantity, self.limits = quantity, limits
+        self.surfaces: Sequence[Surface] = ()
+        low, high = limits
+        step = round((level - low) / ((high - low) or 1.0) * STEPS)
+
+        async def move(_: int) -> None:
+            self._draw()
+
+        label = f"Level{f', {unit}' if unit else ''}"
+        self._slider = RangeSlider(label, STEPS, min(max(step, 1), STEPS - 1), self._text, move, on_release=True)
+        self._legend = ui.html("", sanitize=False)
+        self.scene = BoxScene(box, "Isosurface; drag to turn, scroll to zoom")
+
+    @property
+    def level(self) -> float:
+        """The current level, in the unit of the quantity."""
+        low, high = self.limits
+        return low + (high - low) * self._slider.value / STEPS
+
+    def _text(self, step: int) -> str:
+        low, high = self.limits
+        return f"{low + (high - low) * step / STEPS:.4g}"
+
+    def show(self, surfaces: Sequence[Surface]) -> None:
+        """Replace the surfaces."""
+        self.surfaces = surfaces
+        self._draw()
+
+    def _draw(self) -> None:
+        self.scene.clear()
+        for surface, (colour, opacity) in zip(self.surfaces, COLOURS, strict=False):
+            address = surface_address(surface.name, self.quantity, self.level, surface.frame, surface.stamp)
+            self.scene.add(address, colour, opacity)
+        names = "".join(
+            f"<li><i style='background:{colour};opacity:{opacity}'></i>{escape(surface.name)}</li>"
+            for surface, (colour, opacity) in zip(self.surfaces, COLOURS, strict=False)
+        )
+        self._legend.set_content(f"<ul class=legend>{names}</ul>")
+
+
+class LiveSurface:
+    """A scene with the latest isosurface, added to the page under construction; empty before the first one."""
+
+    def __init__(self) -> None:
+        self.place = ui.element("figure").classes("live-surface")
+        self._scene: BoxScene | None = None
+        self._surfaces: list[Any] = []
+
+    def clear(self) -> None:
+        """Remove the scene."""
+        self.place.clear()
+        self._scene, self._surfaces = None, []
+
+    def show(self, name: str, stamp: int, box: Box, caption: str) -> None:
+        """Show the surface of a look.
+
+        Parameters
+        ----------
+        name : result directory, relative to the project
+        stamp : number that changes with each look
+        box : mm
+        caption : description of the surface
+        """
+        if self._scene is None or self._scene.box != box:
+            self.clear()
+            with self.place:
+                self._scene = BoxScene(box, caption, LIVE_SIZE)
+                self._caption = ui.html("", sanitize=False)
+        for surface in self._surfaces[:-1]:  # the previous one stays until the new one is loaded
+            surface.delete()
+        self._surfaces = [*self._surfaces[-1:], self._scene.add(live_address(name, stamp), COLOURS[0][0])]
+        self._scene.name(f"{caption} Drag to turn, scroll to zoom.")
+        self._caption.set_content(f"<figcaption>{escape(caption)}</figcaption>")
+
+
+def caption_of(look: Look) -> str:
+    """Return the level and extent of the isosurface of a look as text."""
+    volume = look.volume
+    level = default_level(volume)
+    corners = surface_triangles(volume, level).reshape(-1, 3)
+    unit = unit_shown(describe(look.quantity)[0])
+    head = f"Isosurface of {name_of(look.quantity)} at {level:.2g} {unit}".rstrip()
+    if not len(corners):
+        return f"{head}: nowhere yet."
+    ends = zip("xyz", np.min(corners, axis=0), np.max(corners, axis=0), strict=True)
+    spans = ", ".join(f"{axis} from {low:.0f} to {high:.0f}" for axis, low, high in ends)
+    return f"{head}, {spans} mm, after {look.seconds:.0f} s."
