@@ -331,6 +331,7 @@ def agreements(m: Measurement) -> list[float]:
     return [compare(predicted_by_others(m, [i], COARSE)[i], m, i)[0] for i in range(len(m.names))]
 
 
+@pytest.mark.slow
 def test_a_rig_in_metres_is_unrelated_and_the_cause_is_named(small):
     wrong = in_metres(small)
     values = agreements(wrong)

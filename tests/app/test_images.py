@@ -91,6 +91,7 @@ def test_what_is_there_and_what_is_wrong(browser, server):
     assert [a for a in requests(browser) if not a.startswith((*here, "data:"))] == []
 
 
+@pytest.mark.slow
 @needs_browser
 def test_reference_and_flow_change_places_by_key_and_clock(browser, server):
     from selenium.webdriver.common.keys import Keys

@@ -85,6 +85,7 @@ def test_settings_of_another_technique_do_not_apply(files, tmp_path, monkeypatch
 # -- gains of cameras ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_gains_are_part_of_the_result(files, tmp_path):
     """Scores and views evaluated again from the same file are those of the run."""
     even = Measurement.read(files["emission"])

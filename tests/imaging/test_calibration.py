@@ -178,6 +178,7 @@ def changed(view: ViewImages, change: Callable[[Detection], Detection]) -> ViewI
     return replace(view, poses=poses, background=background)
 
 
+@pytest.mark.slow
 def test_a_bad_image_is_left_out_and_named():
     views = images(noise=0.02, poses=8)
     name, bad = next((n, d) for n, d in views[1].poses.items() if n != "0")

@@ -60,6 +60,7 @@ def simulated(camera, steps: int = 40) -> torch.Tensor:
     return view_displacement(make_phantom("gaussians", BOX, seed=1), camera, BOX, 1.00027, steps)
 
 
+@pytest.mark.slow
 def test_the_path_integral_through_a_lens_agrees_with_curved_rays(wide):
     camera = replace(wide.cameras[1], lens=Lens(12.5, points=100))
     exact, thin = simulated(camera), simulated(replace(camera, lens=None))

@@ -130,8 +130,11 @@ LONG = ("refined", "voxels")
     ("name", "lens"),
     [
         *((name, None) for name in RUNS if name not in LONG),
-        *((name, Lens(12.0)) for name in ("fast", "paper")),
-        ("fast", Lens(window=3.0)),
+        ("fast", Lens(12.0)),
+        *(
+            pytest.param("fast", Lens(window=3.0), marks=pytest.mark.slow),
+            pytest.param("paper", Lens(12.0), marks=pytest.mark.slow),
+        ),
         *(pytest.param(name, lens, marks=pytest.mark.slow) for name in LONG for lens in (None, Lens(12.0))),
     ],
 )

@@ -120,6 +120,7 @@ def test_pinned_voxels_stay_ambient_and_the_rest_fits_without_them(measurement, 
     assert np.linalg.norm(iterate.x.numpy().ravel()[inside] - exact) < 1e-6 * np.linalg.norm(exact)
 
 
+@pytest.mark.slow
 def test_bounds_hold_and_the_solution_is_the_bounded_one(measurement, forward):
     problem = make(measurement, bounds=(-4e-5, 1e-5))
     iterate = last(Tikhonov().iterate(problem, problem.zero(), 1e-3), 200)

@@ -69,6 +69,7 @@ def test_sliders_and_keys_change_the_slices(page):
         assert text(page, "#readout") != readout
 
 
+@pytest.mark.slow
 def test_switching_the_quantity_changes_the_colour_bar(page):
     labels, viridis = set(), None
     for quantity, unit in (("n", "n − 1"), ("temperature", "[K]"), ("density", "kg m⁻³")):

@@ -105,6 +105,7 @@ def test_a_warm_frame_starts_from_the_previous_field(undisturbed, five):
     assert float((x - y - (x - y).mean()).abs().max()) < 1e-4 * float(x.abs().max())
 
 
+@pytest.mark.slow
 def test_an_interrupted_chunk_continues_to_the_same_result(undisturbed, short, tmp_path):
     plan = begin(short, tmp_path / "parts.zarr")
 
