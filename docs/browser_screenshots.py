@@ -33,7 +33,7 @@ ROAD = (
     "calibrate images --config images/calibrate.toml -o calibration.toml",
     "displacement images --calibration calibration.toml --lower -25 -25 -25 --upper 25 25 25 -o measurement.nc",
     "check measurement.nc",
-    "reconstruct measurement.nc -o results/flame --time-limit 20 --voxels 48 --uncertainty fast",
+    "reconstruct measurement.nc -o results/flame --max-steps 300 --voxels 48 --uncertainty fast",
     "reconstruct measurement.nc -o results/flame-tv --method tv --voxels 32",
 )
 

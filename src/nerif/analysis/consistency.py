@@ -53,7 +53,8 @@ MAX_OBJECTIVE, MAX_OBJECTIVE_EVERYWHERE = 0.97, 0.8  # of the joint fit, correct
 MAX_DISAGREEMENT = 0.95  # of a view, corrected over uncorrected, that is worth a joint fit
 MAX_EXCHANGED, MAX_EXCHANGED_LAST = 1.15, 1.03  # disagreement of two views, exchanged over unexchanged: worth a joint
 # fit, and at last, predicted without both
-FEW_VIEWS, MAX_OBJECTIVE_FEW = 9, 0.9  # of fewer views, neighbours are further apart: an exchange needs more evidence
+FEW_VIEWS, MAX_OBJECTIVE_FEW, MAX_EXCHANGED_FEW = 9, 0.9, 0.95  # of fewer views, neighbours are further apart: an
+# exchange needs more evidence, in the joint fit and predicted without both
 DISAGREES = 0.5  # agreement of a view over the median, below which it is reported
 WRONG_GAIN = 1.6  # factor of the values of a view
 
@@ -558,9 +559,10 @@ def _most_likely_mistake(small: Measurement, voxels: int, on_step: Callable[[int
         if over_limit > 1:
             return None
         if correction.change is None and len(correction.views) == 2:
-            clear = len(views) >= FEW_VIEWS or ratio < MAX_OBJECTIVE_FEW
+            few = len(views) < FEW_VIEWS
             predicted_pair = predicted_by_others(small, correction.views, voxels)
-            if not clear or _exchanged(predicted_pair, small, correction) > MAX_EXCHANGED_LAST:
+            last = _exchanged(predicted_pair, small, correction)
+            if last > (MAX_EXCHANGED_FEW if few else MAX_EXCHANGED_LAST) or (few and ratio >= MAX_OBJECTIVE_FEW):
                 continue
         if len(correction.views) == len(views):
             return correction

@@ -68,7 +68,7 @@ class Step:
     ----------
     step, epoch : counts; epoch in passes over all rays
     seconds : time of the run, earlier parts of a resumed one included
-    progress : from 0 at the start to 1 at the latest end
+    progress : from 0 at the start to 1 at the end; of a run that ends by convergence, at the next possible end
     losses : the terms by name
     capture : returns the State to resume from
     field : returns the present Field, valid until the method continues

@@ -29,7 +29,7 @@ from nerif.data.measurement import Measurement
 __all__ = ["PAGE"]
 
 AGREE = "Each is predicted by a quick reconstruction from the others."
-REFINE = "Cameras are refined with a quick field: which one is off?"
+REFINE = "Cameras are refined together with a quick field."
 VIEW_SETTINGS = ("voxels", "aperture")
 RIG_LINES = 60  # of its output: a table of the views and the findings
 RIG_SETTINGS = ("pose_sigma_mm", "pose_sigma_deg", "time_limit", "aperture")
@@ -178,4 +178,4 @@ async def build(work: Workspace) -> None:
     CheckPage(work, measurements)
 
 
-PAGE = Page("check", "Check", "/check", "Mistakes that cost a day, found before the reconstruction.", build)
+PAGE = Page("check", "Check", "/check", "Errors of the data and of the calibration, before the reconstruction.", build)

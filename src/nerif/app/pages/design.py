@@ -155,4 +155,4 @@ def _outline(camera: Camera) -> tuple[torch.Tensor, torch.Tensor]:
     return rays.origin[:, :2], rays.end_points[:, :2]
 
 
-PAGE = Page("design", "Design", "/design", "What a rig will see, before anyone drills a hole.", build)
+PAGE = Page("design", "Design", "/design", "Displacement, blur and resolution of a rig before it is built.", build)

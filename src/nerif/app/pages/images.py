@@ -1,4 +1,4 @@
-"""Images: what is in the folder, whether it can be used, and which part of the frames is each view's own."""
+"""Images: those of a folder, their quality, and the crop of each view."""
 
 from __future__ import annotations
 
@@ -181,5 +181,5 @@ async def build(work: Workspace) -> None:
         ui.timer(0.01, lambda: page.build(view), once=True)  # the page is there before its images are read
 
 
-ABOUT = "What is in the folder, whether it can be used, and which part of the frames is each view's own."
+ABOUT = "The images of a folder, their quality, and the crop of each view."
 PAGE = Page("images", "Images", "/images", ABOUT, build)

@@ -406,7 +406,7 @@ class Progress(Callback):
     def report(self, trainer: Trainer, values: dict[str, float], speed: float) -> bool:
         """Call back after a step; return whether the first process requests to stop."""
         schedule, note = trainer.schedule, "; ".join(self.notes)
-        progress = 1.0 if schedule.done else min(schedule.share, 1.0)
+        progress = 1.0 if schedule.done else min(schedule.to_possible_end, 1.0)
         self.notes.clear()
         epoch_steps = len(trainer.data) * trainer.bins.edge**2 / trainer.sampler.pixels(trainer.sampler.mean_draw)
         step = Step(

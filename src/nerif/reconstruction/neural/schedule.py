@@ -75,6 +75,11 @@ class Cycles(Resumable):
         """Steps of all cycles."""
         return self.first * (2**MAX_CYCLES - 1)
 
+    @property
+    def possible_end(self) -> int:
+        """The next step at which the run may have converged."""
+        return max(self.least_steps, self.step + self.length)
+
     def progress(self, step: int) -> float:
         """Return the share of the present cycle: 0 at its start, 1 at its end."""
         return (step - self.step) / self.length
@@ -188,6 +193,11 @@ class Schedule:
     def share(self) -> float:
         """Smallest possible share of the run: 0 at the start, 1 at the latest end."""
         return self.progress if self.cycles is None else self.step / self.cycles.most_steps
+
+    @property
+    def to_possible_end(self) -> float:
+        """Share of the run for a progress bar: 1 at its limit or, without one, at the next step at which it may end."""
+        return self.progress if self.cycles is None else self.step / self.cycles.possible_end
 
     def count(self, rays: int) -> None:
         """Count the rays of a step."""
