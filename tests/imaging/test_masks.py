@@ -8,6 +8,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from nerif.cli.cli import main
 from nerif.data.measurement import Measurement
@@ -118,6 +119,28 @@ def test_drawn_masks_take_precedence(four, tmp_path):
     for folder, names in ((tmp_path / "none", four.names), (tmp_path, ["other"])):
         with refused(folder):
             drawn_masks(folder, names)
+
+
+@pytest.mark.parametrize("name", ["cam1.jpg", "cam1.PNG", "Cam1.png", "CAM1.TIFF"])
+def test_drawings_with_any_ending_and_letters(tmp_path, name):
+    image = np.zeros((40, 40), np.uint8)
+    image[8:32, 8:24] = 255
+    lines: list[str] = []
+    iio.imwrite(tmp_path / name, image)
+    iio.imwrite(tmp_path / "other.png", image)
+    masks = drawn_masks(tmp_path, ["cam1", "cam2"], lines.append)
+    assert {view: path.name for view, path in masks.items()} == {"cam1": name}
+    assert any("other.png" in line for line in lines)
+    assert any("cam2" in line for line in lines)
+
+
+@pytest.mark.parametrize("mode", ["1", "P"])
+@pytest.mark.parametrize("ending", ["png", "tif"])
+def test_masks_of_one_bit_and_with_a_palette(tmp_path, mode, ending):
+    image = np.zeros((20, 30), np.uint8)
+    image[4:9, 5:20] = 255
+    Image.fromarray(image).convert(mode).save(tmp_path / f"m.{ending}")
+    np.testing.assert_array_equal(read_mask(tmp_path / f"m.{ending}", image.shape), image > 0)
 
 
 def test_masks_need_noise_and_flow(four):

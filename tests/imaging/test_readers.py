@@ -551,3 +551,87 @@ def test_invalid_values(tmp_path, image):
     np.save(tmp_path / "a.npy", image)
     with refused("a.npy"):
         open_frames("a.npy", tmp_path)[0]
+
+
+@pytest.mark.parametrize("xml", [False, True])
+def test_photron_films_of_every_nth_frame_have_their_own_times(tmp_path, stack12, xml):
+    header = write_photron(tmp_path, stack12.astype("<u2").tobytes(), bit=16, rate=20000, xml=xml)
+    line, tag = b"Save Step : 5\n", b"<skipFrame>5</skipFrame>"
+    mark, more = (b"<totalFrame>", tag) if xml else (b"Image Width", line)
+    header.write_bytes(header.read_bytes().replace(mark, more + mark))
+    np.testing.assert_allclose(open_frames(header.name, tmp_path).times, np.arange(N) * 5 / 20000)
+
+
+def imagej_stack(path: Path, stack: np.ndarray) -> None:
+    """A stack as ImageJ writes it above 4 GB: one page, then the other images; big-endian."""
+    text = f"ImageJ=1.53t\nimages={len(stack)}\nframes={len(stack)}\n".encode() + b"\0"
+    height, width, start = *stack.shape[1:], 8 + 2 + 12 * 10 + 4
+    data = start + len(text) + 7
+    entries = {254: (4, 0), 256: (4, width), 257: (4, height), 258: (3, 16), 262: (3, 1), 270: (2, start)}
+    entries |= {273: (4, data), 277: (3, 1), 278: (4, height), 279: (4, stack[0].nbytes)}
+    tags = b""
+    for code, (kind, value) in entries.items():
+        packed_value = struct.pack(">HH", value, 0) if kind == 3 else struct.pack(">I", value)
+        tags += struct.pack(">HHI", code, kind, len(text) if code == 270 else 1) + packed_value
+    head = b"MM\0*" + struct.pack(">I", 8) + struct.pack(">H", len(entries)) + tags + struct.pack(">I", 0)
+    path.write_bytes((head + text).ljust(data, b"\0") + stack.astype(">u2").tobytes())
+
+
+def test_large_stacks_of_imagej_have_one_page(tmp_path, stack12):
+    imagej_stack(tmp_path / "s.tif", stack12)
+    same(open_frames(tmp_path / "s.tif"), stack12)
+    data = (tmp_path / "s.tif").read_bytes()
+    (tmp_path / "short.tif").write_bytes(data[:-9])
+    good, errors = good_frames(open_frames(tmp_path / "short.tif"))
+    assert good == [0, 1, 2]
+    assert [name for name in errors if name.endswith("short.tif frame 3")]
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize("compression", [None, "tiff_lzw", "tiff_adobe_deflate", "packbits"])
+def test_orientation_tags_are_ignored_by_every_reader(tmp_path, stack8, orientation, compression):
+    path = tmp_path / "a.tif"
+    Image.fromarray(stack8[0]).save(path, compression=compression, tiffinfo={274: orientation})
+    np.testing.assert_array_equal(open_frames(path)[0], stack8[0])
+    exif = Image.Exif()
+    exif[274] = orientation
+    Image.fromarray(stack8[0]).save(tmp_path / "a.png", exif=exif)
+    np.testing.assert_array_equal(open_frames(tmp_path / "a.png")[0], stack8[0])
+
+
+@pytest.mark.parametrize("compression", [None, "zlib"])
+@pytest.mark.parametrize("bits", [8, 16])
+def test_min_is_white_is_inverted(tmp_path, stack8, bits, compression):
+    image = stack8[0].astype(f"u{bits // 8}")
+    top = 2**bits - 1
+    write_tiff(tmp_path / "w.tif", top - image, photometric="miniswhite", compression=compression)
+    np.testing.assert_array_equal(open_frames(tmp_path / "w.tif")[0], image)
+    Image.fromarray(255 - stack8[0]).save(tmp_path / "l.tif", compression="tiff_lzw", tiffinfo={262: 0})
+    np.testing.assert_array_equal(open_frames(tmp_path / "l.tif")[0], stack8[0])
+
+
+def test_palettes_are_colours(tmp_path, stack8):
+    grey = np.arange(256, dtype=np.uint8)[::-1]
+    for compression in (None, "tiff_lzw"):
+        image = Image.fromarray(stack8[0], mode="P")
+        image.putpalette(np.repeat(grey, 3).tobytes())
+        image.save(tmp_path / "p.tif", compression=compression)
+        np.testing.assert_array_equal(open_frames(tmp_path / "p.tif")[0], grey[stack8[0]])
+
+
+def test_thumbnails_are_no_frames(tmp_path, stack8):
+    import tifffile
+
+    with tifffile.TiffWriter(tmp_path / "t.tif") as file:
+        for image in stack8:
+            file.write(image, photometric="minisblack", metadata=None)
+            file.write(image[::2, ::2], photometric="minisblack", subfiletype=1, metadata=None)
+    same(open_frames(tmp_path / "t.tif"), stack8)
+
+
+def test_an_image_in_two_formats_is_no_repeat(tmp_path, stack8):
+    for image, name in zip(stack8, ("a.tif", "a.png", "b.tif", "b.png"), strict=True):
+        Image.fromarray(image).save(tmp_path / name)
+    with refused(tmp_path.as_posix()):
+        open_frames(tmp_path)
+    assert len(open_frames("*.tif", tmp_path)) == 2

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import io
 import os
 import sys
 
@@ -42,6 +43,9 @@ def main(arguments: list[str] | None = None) -> int:
     130: interrupted; 141: standard output closed.
     """
     try:
+        for stream in (sys.stdout, sys.stderr):
+            if isinstance(stream, io.TextIOWrapper):  # a console without Greek letters shows question marks
+                stream.reconfigure(errors="replace")
         if arguments is None:
             _ignore_code_in_the_current_folder()
             arguments = sys.argv[1:]

@@ -51,7 +51,7 @@ def _remove(path: Path) -> None:
 def read_toml(path: str | os.PathLike[str], expected: str = "TOML file") -> dict[str, Any]:
     """Read a TOML file; `expected` is its content, for the message if there is none."""
     try:
-        return tomllib.loads(Path(path).read_text(encoding="utf-8"))
+        return tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
     except FileNotFoundError:
         raise InputError(f"no such {expected}", field=path) from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, IsADirectoryError) as error:

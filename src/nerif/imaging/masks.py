@@ -17,7 +17,7 @@ from nerif.common.files import atomic
 from nerif.common.settings import NonNegative, Positive, check_settings
 from nerif.data.measurement import Measurement, Observation, integrals_of
 from nerif.imaging.readers.frames import as_float
-from nerif.imaging.readers.open import read_mask
+from nerif.imaging.readers.open import FOLDER_SUFFIXES, read_mask
 
 __all__ = ["MaskSettings", "MaskShape", "drawn_masks", "flow_mask", "mask_of", "with_flow_masks", "write_masks"]
 
@@ -156,14 +156,35 @@ def flow_mask(
     return np.asarray(flow | ~valid)
 
 
-def drawn_masks(folder: Path, names: Iterable[str]) -> dict[str, Path]:
-    """Return the images of masks in a folder, VIEW.png and similar, by the names of their views."""
+def drawn_masks(
+    folder: Path, names: Iterable[str], say: Callable[[str], None] = lambda line: None
+) -> dict[str, Path]:  # fmt: skip
+    """Return the images of masks in a folder, VIEW.png and similar, by the names of their views.
+
+    Any ending of an image counts, and small and capital letters are the same where only one view fits.
+
+    Parameters
+    ----------
+    say : called with a line about files that fit no view, and about views without a drawing
+    """
     if not folder.is_dir():
         raise InputError("no such folder; expected one with VIEW.png for each view", field=folder)
-    files = {p.stem: p for p in sorted(folder.iterdir()) if p.suffix in (".png", ".tif", ".tiff", ".bmp")}
-    masks = {name: files[name] for name in names if name in files}
+    names = tuple(names)
+    files = [p for p in sorted(folder.iterdir()) if p.suffix.lower() in FOLDER_SUFFIXES and p.name[0] != "."]
+    masks: dict[str, Path] = {}
+    for path in files:
+        fitting = [n for n in names if n == path.stem] or [n for n in names if n.lower() == path.stem.lower()]
+        if len(fitting) != 1:
+            say(f"{path}: not used, it has the name of no view ({', '.join(names)})")
+            continue
+        if fitting[0] in masks:
+            other = masks[fitting[0]].name
+            raise InputError(f"a second mask of view '{fitting[0]}', beside {other}; remove one", field=path)
+        masks[fitting[0]] = path
     if not masks:
         raise InputError(f"expected images with the names of the views, {', '.join(names)}, got none", field=folder)
+    if missing := [name for name in names if name not in masks]:
+        say(f"{folder}: no drawing of {', '.join(missing)}; masks by threshold")
     return masks
 
 

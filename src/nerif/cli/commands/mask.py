@@ -50,7 +50,7 @@ def run(settings: Mask) -> Measurement:
         measurement.write(settings.out)
         say(f"{settings.out}: without flow masks")
         return measurement
-    drawings = {} if settings.drawings is None else drawn_masks(settings.drawings, measurement.names)
+    drawings = {} if settings.drawings is None else drawn_masks(settings.drawings, measurement.names, say)
     with counting_bar("masking the flow", len(measurement.names)) as bar:
         measurement = with_flow_masks(measurement, settings.masks, settings.sigma, drawings, bar)
     assert measurement.flow_mask is not None

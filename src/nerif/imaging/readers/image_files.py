@@ -6,7 +6,7 @@ import logging
 import re
 import weakref
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
@@ -95,7 +95,11 @@ class ImageFile(ABC):
 
 
 class Tiff(ImageFile):
-    """A TIFF file, each page an image."""
+    """A TIFF file, each page an image, without thumbnails; its values as stored, whatever the orientation tag says.
+
+    Larger values are brighter: MinIsWhite is inverted, a palette becomes colours. ImageJ writes stacks above 4 GB with
+    one page only, behind which the other images follow.
+    """
 
     def __init__(self, path: Path) -> None:
         import tifffile
@@ -105,10 +109,14 @@ class Tiff(ImageFile):
         weakref.finalize(self, handle.close)
         with _quiet():
             self._tiff = tifffile.TiffFile(handle)
-            self._pages = len(self._tiff.pages)
+            pages = self._tiff.pages
+            self._pages = list(range(len(pages)))
+            if any(_is_reduced(pages[i]) for i in self._pages[:2]):  # of a long film, all pages take seconds
+                self._pages = [i for i in self._pages if not _is_reduced(pages[i])] or [0]
+            self._stack = len(pages) == 1 and self._tiff.is_imagej and _images_of_imagej(self._tiff)
 
     def __len__(self) -> int:
-        return self._pages + self._is_truncated()
+        return self._stack or len(self._pages) + self._is_truncated()
 
     def _is_truncated(self) -> bool:
         """Whether the last page points beyond the end of the file, which tifffile ignores silently."""
@@ -120,29 +128,48 @@ class Tiff(ImageFile):
         return int.from_bytes(handle.read(layout.offsetsize), order) >= self._path.stat().st_size
 
     def read(self, i: int) -> np.ndarray:
-        if i >= self._pages:
-            raise ValueError(f"the file ends after {self._pages} frames")
+        if self._stack:
+            return self._read_from_stack(i)
+        if i >= len(self._pages):
+            raise ValueError(f"the file ends after {len(self._pages)} frames")
         with _quiet():
-            page: Any = self._tiff.pages[i]
-            if page.bitspersample < 8:
+            page: Any = self._tiff.pages[self._pages[i]]
+            if 1 < page.bitspersample < 8:
                 raise _too_few_bits(page.bitspersample)
             try:
                 image = page.asarray()
             except (ValueError, NotImplementedError) as error:
                 if "imagecodecs" not in str(error):
                     raise
-                return self._read_by_opencv(i, page.bitspersample)
-        return np.moveaxis(image, 0, -1) if page.axes == "SYX" else image
+                return self._read_by_opencv(self._pages[i], page)
+        if page.photometric == PALETTE and page.colormap is not None:
+            return np.moveaxis(page.colormap[:, image] >> 8, 0, -1).astype(np.uint8)
+        image = np.moveaxis(image, 0, -1) if page.axes == "SYX" else image
+        return _inverted(image, page.bitspersample) if page.photometric == MIN_IS_WHITE else image
 
-    def _read_by_opencv(self, i: int, bits: int) -> np.ndarray:
-        """Compressed and packed pages that tifffile cannot decode; OpenCV shifts packed bits to the top."""
+    def _read_from_stack(self, i: int) -> np.ndarray:
+        """An image behind the only page of an ImageJ stack."""
+        page: Any = self._tiff.pages[0]
+        first, size = page.dataoffsets[0], int(np.prod(page.shape)) * page.dtype.itemsize
+        image = np.fromfile(self._path, page.dtype.newbyteorder(self._tiff.byteorder), size // page.dtype.itemsize,
+                            offset=first + i * size)  # fmt: skip
+        if image.nbytes < size:
+            raise ValueError(f"the file ends within or before frame {i} of {self._stack}")
+        image = image.reshape(page.shape)
+        return _inverted(image, page.bitspersample) if page.photometric == MIN_IS_WHITE else image
+
+    def _read_by_opencv(self, i: int, page: Any) -> np.ndarray:
+        """Compressed and packed pages that tifffile cannot decode; OpenCV shifts packed bits to the top and turns."""
         import cv2
 
         _, images = cv2.imreadmulti(str(self._path), start=i, count=1, flags=cv2.IMREAD_UNCHANGED)
         if not images:
             raise ValueError("neither tifffile nor OpenCV can decode it")
-        image = np.asarray(images[0])
-        return _as_rgb(np.right_shift(image, 16 - bits) if 8 < bits < 16 else image)
+        image, bits = np.asarray(images[0]), page.bitspersample
+        if (orientation := page.tags.valueof("Orientation")) in TURNED:
+            image = TURNED[orientation](image)
+        image = np.right_shift(image, 16 - bits) if 8 < bits < 16 else image
+        return _inverted(image, bits) if page.photometric == MIN_IS_WHITE else _as_rgb(image)
 
     @property
     def bits(self) -> int | None:  # type: ignore[override]
@@ -182,11 +209,14 @@ class Png(ImageFile):
         chunks = _png_chunks(data)
         if not data.startswith(b"\x89PNG") or b"IEND" not in chunks:
             raise ValueError("no end of a PNG file" if data.startswith(b"\x89PNG") else "no PNG file")
-        if (depth := chunks[b"IHDR"][8]) < 8:
+        depth, palette = chunks[b"IHDR"][8], chunks[b"IHDR"][9] == PNG_PALETTE
+        if 1 < depth < 8 and not palette:
             raise _too_few_bits(depth)
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
         if image is None:
             raise ValueError("OpenCV cannot decode it")
+        if depth == 1 and not palette:
+            return image > 0
         bits = _significant_bits(chunks)
         return _as_rgb(np.right_shift(image, 16 - bits) if bits else image)  # the format stores them at the top
 
@@ -251,6 +281,35 @@ def _lvpyio() -> Any:
             field="LaVision files (.im7, .vc7)",
         ) from None
     return lvpyio
+
+
+MIN_IS_WHITE, PALETTE = 0, 3  # photometric interpretations of TIFF
+PNG_PALETTE = 3  # colour type
+REDUCED = 1  # bit of NewSubfileType: a thumbnail
+
+TURNED: dict[int, Callable[[np.ndarray], np.ndarray]] = {
+    2: lambda a: a[:, ::-1], 3: lambda a: a[::-1, ::-1], 4: lambda a: a[::-1], 5: lambda a: a.swapaxes(0, 1),
+    6: lambda a: np.rot90(a, 1), 7: lambda a: np.rot90(a, 2).swapaxes(0, 1), 8: lambda a: np.rot90(a, -1),
+}  # fmt: skip
+"""How to undo the orientations of TIFF, which OpenCV applies."""
+
+
+def _is_reduced(page: Any) -> bool:
+    return bool(int(page.tags.valueof("NewSubfileType", 0) or 0) & REDUCED) if hasattr(page, "tags") else False
+
+
+def _images_of_imagej(tiff: Any) -> int:
+    """The number of images of an ImageJ stack with one page; 0 unless there are several."""
+    page: Any = tiff.pages[0]
+    count = int((tiff.imagej_metadata or {}).get("images", 1))
+    return count if count > 1 and page.compression == 1 and len(page.dataoffsets) == 1 else 0
+
+
+def _inverted(image: np.ndarray, bits: int) -> np.ndarray:
+    if image.dtype == bool:
+        return ~image
+    top = (1 << bits) - 1
+    return (top - image).astype(image.dtype) if image.dtype.kind == "u" else image.max() - image
 
 
 OPENERS: dict[str, type[ImageFile]] = {

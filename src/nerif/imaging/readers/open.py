@@ -20,7 +20,7 @@ from nerif.imaging.readers.frames import Frames, SelectedFrames, size_in_words
 from nerif.imaging.readers.image_files import FileFrames
 from nerif.imaging.readers.photron import PhotronFrames
 
-__all__ = ["open_frames", "read_mask"]
+__all__ = ["FOLDER_SUFFIXES", "open_frames", "read_mask"]
 
 FOLDER_SUFFIXES = (".tif", ".tiff", ".png", ".bmp", ".jpg", ".jpeg", ".im7")
 SINGLE_SUFFIXES = (".cih", ".cihx", ".mraw", ".npy", ".npz", ".h5", ".hdf5", ".hdf")
@@ -53,8 +53,13 @@ def open_frames(spec: str | Path, base: Path | None = None) -> Frames:
 
 
 def read_mask(path: Path, shape: tuple[int, int]) -> Bool[np.ndarray, "row column"]:
-    """Read a mask from an image of `shape`: True above the middle of its range."""
-    image = open_frames(path)[0]
+    """Read a mask from an image of `shape`, of 1 bit or more: True above the middle of its range."""
+    frames = open_frames(path)
+    try:
+        stored = frames.load(0)
+    except Exception:  # reported by the next line
+        stored = frames[0]
+    image = stored.astype(np.uint8) if stored.dtype == bool else frames[0]
     if image.shape != shape:
         raise InputError(
             f"expected a mask of {size_in_words(shape)} as the view, got {size_in_words(image.shape)}", field=path
@@ -114,7 +119,21 @@ def _find_files(path: Path, base: Path | None) -> list[Path]:
             raise InputError(f"expected files of this pattern, got none{_nearest(path, base)}", field=label)
     else:
         raise InputError(f"no such file or folder{_nearest(path, base)}", field=label)
+    _check_twins(files, label)
     return sorted(files, key=_natural)
+
+
+def _check_twins(files: list[Path], label: str) -> None:
+    """Refuse images that are there in two formats, as cameras and converters leave them: they are no repeats."""
+    first: dict[Path, Path] = {}
+    for path in sorted(files):
+        twin = first.setdefault(path.with_suffix(""), path)
+        if twin is not path:
+            raise InputError(
+                f"{twin.name} and {path.name} seem to be one image in two formats; name one of them, such as "
+                f"'{label}/*{twin.suffix}', or move the others",
+                field=label,
+            )
 
 
 def _nearest(path: Path, base: Path | None) -> str:

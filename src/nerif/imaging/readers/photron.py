@@ -23,13 +23,14 @@ TAGS = {
     "Image Height": "imageDataInfo/resolution/height",
     "Image Width": "imageDataInfo/resolution/width",
     "Record Rate(fps)": "recordInfo/recordRate",
+    "Save Step": "frameInfo/skipFrame",
     "File Format": "imageFileInfo/fileFormat",
 }
 """Keys of a .cih header and their places in the XML of a .cihx header."""
 
 
 class PhotronFrames(Frames):
-    """A Photron recording; the time of frame i is i / rate."""
+    """A Photron recording, of which every n-th frame was saved (Save Step n); the time of frame i is i n / rate."""
 
     def __init__(self, path: Path, name: str) -> None:
         is_data = path.suffix.lower() == ".mraw"
@@ -42,7 +43,8 @@ class PhotronFrames(Frames):
         self.metadata_bits = min(int(cih["EffectiveBit Depth"]), self._stored)
         upper = self._stored == 16 and cih.get("EffectiveBit Side", "").lower() == "higher"
         self._shift = self._stored - self.metadata_bits if upper else 0
-        self.times = np.arange(self._frames) / float(cih["Record Rate(fps)"])
+        step = max(1.0, float(cih.get("Save Step") or 1))  # some cameras write 0 for every frame
+        self.times = np.arange(self._frames) * step / float(cih["Record Rate(fps)"])
 
     def __len__(self) -> int:
         return self._frames
@@ -96,6 +98,7 @@ def _header(path: Path, name: str) -> dict[str, str]:
         text = path.read_bytes().decode("utf-8", errors="ignore")
         cih = _from_xml(text) if path.suffix.lower() == ".cihx" else _from_lines(text)
         positive = min(float(cih[key]) for key in NUMBERS) > 0
+        float(cih.get("Save Step") or 1)
         kind, stored = cih["File Format"], int(cih["Color Bit"])
     except (KeyError, ValueError, ElementTree.ParseError) as error:
         reason = f"no {error}" if isinstance(error, KeyError) else str(error)

@@ -27,7 +27,7 @@ def read_transforms(path: Path) -> list[CalibratedCamera]:
     corner of the first pixel, whose centre is at 0.5. Entries of a frame override those above the frames.
     """
     try:
-        content = json.loads(path.read_text())
+        content = json.loads(path.read_text(encoding="utf-8-sig"))
     except (ValueError, UnicodeDecodeError):
         raise InputError("not a JSON file, or truncated", field=path) from None
     frames = content.get("frames") if isinstance(content, dict) else None
