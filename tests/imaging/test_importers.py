@@ -564,6 +564,15 @@ def test_camera_parameters_by_to_struct(mat, release, radial, pose):
     refuse(mat({**struct, "RadialDistortion": np.ones(5)}), "at most 3 radial and 2 tangential .*, got 5 and 2")
 
 
+@pytest.mark.parametrize(("unit", "mm"), [("meters", 1000.0), ("inches", 25.4), ("m", 1000.0), ("millimeters", 1.0)])
+def test_world_units_of_the_toolbox(mat, unit, mm):
+    struct = camera_parameters(3, "R2022b")
+    (plain,) = import_cameras(mat(struct), ImportSettings())
+    (camera,) = import_cameras(mat({**struct, "WorldUnits": unit}), ImportSettings())
+    np.testing.assert_allclose(camera.translation, np.asarray(plain.translation) * mm)
+    refuse(mat({**struct, "WorldUnits": "furlongs"}), "WorldUnits: expected one of .* got 'furlongs'")
+
+
 def test_camera_parameters_of_several_cameras_or_one_pose(mat):
     left, right = camera_parameters(1, "R2022b"), camera_parameters(2, "R2021a")
     single = {k: v[:1] if k in ("RotationVectors", "TranslationVectors") else v for k, v in left.items()}

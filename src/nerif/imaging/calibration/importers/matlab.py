@@ -36,6 +36,9 @@ DISTORTION = ("distortion", "dist", "dist_coeffs", "distCoeffs", "kc", "D")
 """Names of the coefficients beside plain K, R, t."""
 STACKED = {"K": 2, "R": 2, "t": 1, "T": 1, **dict.fromkeys(DISTORTION, 1), "image_size": 1}
 """Dimensions of plain arrays of one camera; with one more, the last axis counts cameras."""
+WORLD_UNITS = {"millimeters": 1.0, "mm": 1.0, "centimeters": 10.0, "cm": 10.0, "meters": 1e3, "m": 1e3, "inches": 25.4}
+WORLD_UNITS |= {"in": 25.4, "micrometers": 1e-3, "um": 1e-3, "feet": 304.8}
+"""Units of lengths, mm."""
 READABLE = (b"double", b"single", b"cell", b"char", b"struct", b"logical", b"int", b"uint")
 
 
@@ -129,10 +132,19 @@ def _toolbox(
     k1, k2, k3 = np.pad(radial, (0, 3 - radial.size))
     p1, p2 = np.pad(tangential, (0, 2 - tangential.size))
     rotation, translation = fixed or _pose(content, where, pose)
+    translation = np.asarray(translation, dtype=np.float64) * _mm_per_unit(content, where)
     size = _size(content, "ImageSize")
     camera = CalibratedCamera.from_values(where, name, k, rotation, translation, [k1, k2, p1, p2, k3], size)
     camera.intrinsics[:2, 2] -= 1  # pixels count from 1
     return camera
+
+
+def _mm_per_unit(content: dict[str, Any], where: str) -> float:
+    """WorldUnits in mm, the default of the toolbox."""
+    unit = str(content.get("WorldUnits") or "mm").strip().lower()
+    if unit not in WORLD_UNITS:
+        raise InputError(f"expected one of {', '.join(WORLD_UNITS)}, got '{unit}'", field=f"{where}: WorldUnits")
+    return WORLD_UNITS[unit]
 
 
 def _pose(content: dict[str, Any], where: str, pose: int) -> tuple[np.ndarray, np.ndarray]:
