@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import itertools
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -148,7 +147,12 @@ def rays_of(m: Measurement) -> Rays:
 
 @pytest.mark.parametrize(
     ("kind", "basis"),
-    [*itertools.product(SIMULATED.values(), ["linear", "cubic"]), (Knife, "cubic"), (Cubic, "cubic")],
+    [
+        *((kind, "cubic") for kind in SIMULATED.values()),
+        *(pytest.param(kind, "linear", marks=pytest.mark.slow) for kind in SIMULATED.values()),
+        (Knife, "cubic"),
+        (Cubic, "cubic"),
+    ],
     ids=lambda x: x if isinstance(x, str) else x.name,
 )
 def test_the_voxel_operator_and_its_adjoint(kind, basis, measured, balls):

@@ -49,7 +49,7 @@ def error(result, box, truth=None):
 
 
 @pytest.mark.parametrize("text", ["axis", "planar", "axis+2"])
-@pytest.mark.parametrize("basis", ["cubic", "linear"])
+@pytest.mark.parametrize("basis", ["cubic", pytest.param("linear", marks=pytest.mark.slow)])
 def test_the_operator_is_the_path_integral_of_its_field_and_has_its_adjoint(jet, text, basis):
     direction = (0.1, 1.0, 0.03) if text == "planar" else (0.1, 0.05, 1.0)
     symmetry = Symmetry.about(text, (1.0, 2.0, 0.0), direction, 0.2)

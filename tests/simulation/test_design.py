@@ -100,6 +100,7 @@ def test_a_good_rig_has_no_notes():
         DesignSettings(f_number=0.0)
 
 
+@pytest.mark.slow
 def test_the_command_prints_and_draws(tmp_path, capsys):
     out = tmp_path / "design.png"
     assert main(["design", "--temperature", "1800", "--views", "4", "-o", str(out)]) == 0
