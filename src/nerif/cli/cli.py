@@ -44,8 +44,8 @@ def main(arguments: list[str] | None = None) -> int:
     """
     try:
         for stream in (sys.stdout, sys.stderr):
-            if isinstance(stream, io.TextIOWrapper):  # a console without Greek letters shows question marks
-                stream.reconfigure(errors="replace")
+            if isinstance(stream, io.TextIOWrapper) and stream.encoding.lower() not in ("utf-8", "utf8"):
+                stream.reconfigure(errors="replace")  # a console without Greek letters shows question marks
         if arguments is None:
             _ignore_code_in_the_current_folder()
             arguments = sys.argv[1:]
