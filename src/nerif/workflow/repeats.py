@@ -7,11 +7,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from nerif.analysis.prediction import on_voxels, reproject
+from nerif.analysis.prediction import reproject
 from nerif.data.measurement import Measurement
 from nerif.data.volume import Volume
 from nerif.fields.base import Field
-from nerif.fields.network import NeuralField
 from nerif.geometry import Grid
 from nerif.physics.quantities import GasSettings, derive_all, masked_lines
 from nerif.reconstruction.base import Reconstruction, Reconstructor
@@ -102,8 +101,5 @@ class Members:
         say(f"{word} from {deviations.count} trials: {size}")
 
     def _projections(self, field: Field, main: Reconstruction) -> Maps:
-        """Projections of a field; of a network, of a spline through it, which is accurate enough for its residuals."""
         with self.monitor.counting("projecting the field") as bar:
-            if isinstance(field, NeuralField):
-                field = on_voxels(field, self.training.box, main.device)
             return reproject(field, self.training, (), main.device, bar, main.model).maps
