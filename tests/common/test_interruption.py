@@ -71,10 +71,10 @@ STAGES = {
 }
 
 
-QUICK = ("before the first step", "re-projecting")
+FIRST_STAGES = ("before the first step", "re-projecting")
 
 
-@pytest.mark.parametrize("stage", [s if s in QUICK else pytest.param(s, marks=pytest.mark.slow) for s in STAGES])
+@pytest.mark.parametrize("stage", [s if s in FIRST_STAGES else pytest.param(s, marks=pytest.mark.slow) for s in STAGES])
 def test_a_reconstruction_reports_what_is_saved_and_continues(stage, measurement, tmp_path, monkeypatch):
     name, first = STAGES[stage], stage == "before the first step"
     path, out = tmp_path / "m.nc", tmp_path / "r"
