@@ -278,20 +278,9 @@ def test_priors_are_given_or_of_the_camera_or_the_default(measured, view, mm, si
 
 
 def test_significant_corrections_are_reported():
-    near = {
-        "name": "a",
-        "correction_over_sigma": 0.5,
-        "image_shift_px": 0.0,
-        "values": {"shift_x": 0.1},
-        "prior_sigma": {"shift_x": 0.2},
-    }
-    far = {
-        "name": "b",
-        "correction_over_sigma": 5.0,
-        "image_shift_px": 0.0,
-        "values": {"shift_x": 1.0},
-        "prior_sigma": {"shift_x": 0.2},
-    }
+    near = {"name": "a", "correction_over_sigma": 0.5, "image_shift_px": 0.0}
+    near |= {"values": {"shift_x": 0.1}, "prior_sigma": {"shift_x": 0.2}}
+    far = {**near, "name": "b", "correction_over_sigma": 5.0, "values": {"shift_x": 1.0}}
     first, line = refinement_lines([near, far, near, near])
     assert "b, 5.0 sigma" in first
     assert line.startswith("view b is not where its calibration says: shift_x 1 mm, 5.0 sigma")

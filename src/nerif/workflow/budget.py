@@ -75,8 +75,9 @@ def _sampling(reconstructor: Reconstructor, measurement: Measurement, voxels: in
     if not isinstance(reconstructor, TrainingSettings):
         return 0.0
     device = resolve_device(reconstructor.device)
-    network = Network(reconstructor.resolved_by(measurement).network).to(device)
-    points = torch.rand(PROBE, 3, device=device)
+    with torch.random.fork_rng(devices=[]):
+        network = Network(reconstructor.resolved_by(measurement).network).to(device)
+    points = torch.zeros(PROBE, 3, device=device)
     times = []
     for _ in range(4):  # the first is slower
         start = time.perf_counter()
