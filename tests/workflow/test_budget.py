@@ -27,8 +27,8 @@ def test_fits_share_what_is_left_after_the_reserve(clock):
     limit = Budget(60.0, 1000.0, 10.0)
     clock.seconds = 1005.0
     assert limit.allot(Tikhonov(time_limit=60.0), 1 / 3).time_limit == pytest.approx(45 / 3)
-    clock.seconds = 1045.0
-    assert limit.allot(NeRIF(time_limit=60.0)).time_limit == pytest.approx(5.0)
+    clock.seconds = 1040.0
+    assert limit.allot(NeRIF(time_limit=60.0)).time_limit == pytest.approx(10.0)
     clock.seconds = 1100.0
     assert limit.allot(NeRIF(time_limit=60.0)).time_limit == pytest.approx(LEAST * 60)  # a fit takes a few steps
 
