@@ -192,7 +192,7 @@ def _of_outcome(result: Result) -> list[Statement]:
     level, text = {
         "diverged": ("bad", f"The run diverged. {message}"),
         "collapsed": ("bad", f"The field collapsed to the ambient. {message}"),
-        "interrupted": ("warning", f"The run was interrupted; --resume continues it. {message}"),
+        "interrupted": ("warning", "The run was interrupted; --resume continues it."),
         "time_limit": ("note", limit.format("time limit")),
         "steps": ("note", limit.format("limit of steps")),
     }.get(str(outcome), ("", ""))
