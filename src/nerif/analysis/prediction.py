@@ -31,7 +31,7 @@ from nerif.reconstruction.voxels.symmetric_operator import project_spline
 
 VOXEL_STEP = {"linear": 0.1, "cubic": 0.25}  # voxels between samples
 SAMPLES = 80  # per ray; error 0.06 % of the rms displacement for a network fitted to the flame
-GRADIENT_COST = 3.0
+GRADIENT_COST = 3.0  # of value and gradient, in evaluations: a forward pass and a backward pass of twice its work
 EXACT_WORK = {"cpu": 1e11, "cuda": 1e13}  # multiplications: four seconds on two cores
 SPLINE_VOXELS, SPLINE_MARGIN = 100, 3  # along the longest edge of the box, and beyond each face
 SYMMETRIC_VOXELS = 400  # along the longest edge of (r, h)
