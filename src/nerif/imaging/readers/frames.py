@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import operator
 from abc import ABC, abstractmethod
 from collections import Counter
@@ -13,10 +14,11 @@ import numpy as np
 
 from nerif.common.conventions import InputError
 
-__all__ = ["Frames", "Layout", "SelectedFrames", "as_float", "read_each", "size_in_words"]
+__all__ = ["Frames", "Layout", "SelectedFrames", "as_float", "check_size", "read_each", "size_in_words"]
 
 LUMINANCE = np.array([0.299, 0.587, 0.114])  # of R, G, B (ITU-R BT.601)
 SAMPLE = 5  # frames that determine the layout
+MOST_PIXELS = 2**28  # of a frame, more than any sensor has: a damaged header must not fill the memory
 
 
 @dataclass(frozen=True)
@@ -149,6 +151,12 @@ class SelectedFrames(Frames):
 def as_float(values: np.ndarray) -> np.ndarray:
     """Return an array as float32, or as float64 where its type needs that: arithmetic of integers would overflow."""
     return np.asarray(values, dtype=np.result_type(values.dtype, np.float32))
+
+
+def check_size(shape: Sequence[int]) -> None:
+    """Refuse a size in a file's header that no sensor has."""
+    if min(shape) < 1 or math.prod(shape) > MOST_PIXELS:
+        raise InputError(f"damaged header: expected a size of a sensor, got {size_in_words(shape)}; copy it again")
 
 
 def size_in_words(shape: Sequence[int]) -> str:

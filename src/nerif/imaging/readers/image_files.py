@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import re
 import weakref
+import zlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -16,7 +17,7 @@ import numpy as np
 
 from nerif.common.conventions import InputError
 from nerif.common.installation import install
-from nerif.imaging.readers.frames import Frames
+from nerif.imaging.readers.frames import Frames, check_size
 
 __all__ = ["FileFrames"]
 
@@ -136,6 +137,7 @@ class Tiff(ImageFile):
             page: Any = self._tiff.pages[self._pages[i]]
             if 1 < page.bitspersample < 8:
                 raise _too_few_bits(page.bitspersample)
+            check_size(page.shape)
             try:
                 image = page.asarray()
             except (ValueError, NotImplementedError) as error:
@@ -187,13 +189,17 @@ class Tiff(ImageFile):
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Silence the log of tifffile: the error that follows reports the damage."""
-    logger = logging.getLogger("tifffile")
+    """Silence the messages of tifffile and OpenCV: the error that follows reports the damage."""
+    import cv2
+
+    logger, level = logging.getLogger("tifffile"), cv2.utils.logging.getLogLevel()
     before, logger.disabled = logger.disabled, True
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
         yield
     finally:
         logger.disabled = before
+        cv2.utils.logging.setLogLevel(level)
 
 
 class Png(ImageFile):
@@ -226,13 +232,16 @@ class Png(ImageFile):
 
 
 def _png_chunks(data: bytes) -> dict[bytes, bytes]:
-    """The first chunk of each kind."""
+    """The first chunk of each kind; the checksums of all are checked, as OpenCV prints what does not fit."""
     chunks: dict[bytes, bytes] = {}
     start = 8
     while start + 8 <= len(data):
         size, kind = int.from_bytes(data[start : start + 4]), data[start + 4 : start + 8]
-        chunks.setdefault(kind, data[start + 8 : start + 8 + size])
-        start += 12 + size
+        end = start + 8 + size
+        if end + 4 <= len(data) and zlib.crc32(data[start + 4 : end]) != int.from_bytes(data[end : end + 4]):
+            raise ValueError(f"wrong checksum in the chunk at byte {start}")
+        chunks.setdefault(kind, data[start + 8 : end])
+        start = end + 4
     return chunks
 
 

@@ -8,12 +8,14 @@ from pathlib import Path
 import numpy as np
 
 from nerif.common.conventions import InputError
-from nerif.imaging.readers.frames import Frames
+from nerif.imaging.readers.frames import Frames, check_size
 
 __all__ = ["PhotronFrames"]
 
 NUMBERS = ("Color Bit", "EffectiveBit Depth", "Total Frame", "Image Height", "Image Width", "Record Rate(fps)")
 """Positive numbers that a .cih header must have."""
+
+MOST_FRAMES = 2**26  # more than any camera's memory holds
 
 TAGS = {
     "Color Bit": "imageDataInfo/colorInfo/bit",
@@ -97,9 +99,10 @@ def _header(path: Path, name: str) -> dict[str, str]:
     try:
         text = path.read_bytes().decode("utf-8", errors="ignore")
         cih = _from_xml(text) if path.suffix.lower() == ".cihx" else _from_lines(text)
-        positive = min(float(cih[key]) for key in NUMBERS) > 0
+        *counts, rate = (float(cih[key]) if key == NUMBERS[-1] else int(cih[key]) for key in NUMBERS)
+        positive = min(*counts, rate) > 0 and counts[2] <= MOST_FRAMES
         float(cih.get("Save Step") or 1)
-        kind, stored = cih["File Format"], int(cih["Color Bit"])
+        kind, stored = cih["File Format"], int(counts[0])
     except (KeyError, ValueError, ElementTree.ParseError) as error:
         reason = f"no {error}" if isinstance(error, KeyError) else str(error)
         raise InputError(f"cannot be read as a Photron header ({reason}); export it again", field=name) from None
@@ -110,7 +113,15 @@ def _header(path: Path, name: str) -> dict[str, str]:
             field=name,
         )
     if not positive:
-        raise InputError(f"expected {', '.join(NUMBERS)} above 0, got {[cih[key] for key in NUMBERS]}", field=name)
+        raise InputError(
+            f"expected {', '.join(NUMBERS)} above 0, and at most {MOST_FRAMES} frames, got "
+            f"{', '.join(cih[key] for key in NUMBERS)}",
+            field=name,
+        )
+    try:
+        check_size((int(cih["Image Height"]), int(cih["Image Width"])))
+    except InputError as error:
+        raise error.inside(name) from None
     return cih
 
 
