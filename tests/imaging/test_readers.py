@@ -116,6 +116,17 @@ def test_bits_of_metadata(tmp_path, stack12):
     assert frames.bits == 12
 
 
+@pytest.mark.parametrize(("codes", "cfa"), [(bytes([0, 1, 1, 2]), "RGGB"), (bytes([1, 2, 0, 1]), "GBRG")])
+def test_bayer_pattern_of_tiff(tmp_path, stack12, codes, cfa):
+    tags = [(33421, "H", 2, (2, 2), True), (33422, "B", 4, codes, True)]
+    write_tiff(tmp_path / "a.tif", stack12[0], photometric="cfa", extratags=tags)
+    write_tiff(tmp_path / "grey.tif", stack12[0], extratags=tags)
+    frames = open_frames(tmp_path / "a.tif")
+    np.testing.assert_array_equal(frames.load(0), stack12[0])
+    assert [frames.cfa, open_frames(f"{tmp_path}/a.tif[:]").cfa] == [cfa, cfa]
+    assert open_frames(tmp_path / "grey.tif").cfa is None
+
+
 @pytest.mark.parametrize("suffix", [".png", ".bmp"])
 def test_images_of_8_bit(tmp_path, stack8, suffix):
     write_images(tmp_path / "cam1", stack8, suffix)

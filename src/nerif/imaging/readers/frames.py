@@ -46,6 +46,11 @@ class Frames(ABC):
     """Recording time of each frame, s; None if the file has none."""
     metadata_bits: int | None = None
     """Effective bits in the metadata of the file."""
+    cfa: str | None = None
+    """Bayer pattern of raw values in the metadata, such as RGGB: the colours of the first two pixels of the first two
+    rows; None if unknown or none."""
+    notes: tuple[str, ...] = ()
+    """Warnings about the file, each a line that begins with its name."""
 
     @abstractmethod
     def __len__(self) -> int: ...
@@ -133,6 +138,7 @@ class SelectedFrames(Frames):
 
     def __init__(self, frames: Frames, indices: Sequence[int]) -> None:
         self._frames, self._indices, self.metadata_bits = frames, indices, frames.metadata_bits
+        self.cfa = frames.cfa
         if frames.times is not None:
             self.times = frames.times[list(indices)]
 
@@ -144,6 +150,10 @@ class SelectedFrames(Frames):
 
     def load(self, i: int) -> np.ndarray:
         return self._frames.load(self._indices[i])
+
+    @property
+    def notes(self) -> tuple[str, ...]:  # type: ignore[override]
+        return self._frames.notes
 
 
 def as_float(values: np.ndarray) -> np.ndarray:

@@ -68,13 +68,27 @@ class FileFrames(Frames):
             raise error.inside(self.name(i)) from None
 
     @cached_property
-    def metadata_bits(self) -> int | None:  # type: ignore[override]
+    def _metadata(self) -> tuple[int | None, str | None, tuple[str, ...]]:
+        """Bits, Bayer pattern and notes of the first readable file."""
         for k in range(len(self._files)):
             try:
-                return self._open(k).bits
+                file = self._open(k)
+                return file.bits, file.cfa, tuple(f"{self._names[k]}: {note}" for note in file.notes)
             except Exception:  # reported when the frame is read
                 continue
-        return None
+        return None, None, ()
+
+    @property
+    def metadata_bits(self) -> int | None:  # type: ignore[override]
+        return self._metadata[0]
+
+    @property
+    def cfa(self) -> str | None:  # type: ignore[override]
+        return self._metadata[1]
+
+    @property
+    def notes(self) -> tuple[str, ...]:  # type: ignore[override]
+        return self._metadata[2]
 
 
 class ImageFile(ABC):
@@ -82,6 +96,10 @@ class ImageFile(ABC):
 
     bits: int | None = None
     """Effective bits in the metadata."""
+    cfa: str | None = None
+    """Bayer pattern in the metadata."""
+    notes: tuple[str, ...] = ()
+    """Warnings about the file."""
 
     @abstractmethod
     def __init__(self, path: Path) -> None: ...
@@ -170,6 +188,13 @@ class Tiff(ImageFile):
             image = TURNED[orientation](image)
         image = np.right_shift(image, 16 - bits) if 8 < bits < 16 else image
         return _inverted(image, bits) if page.photometric == MIN_IS_WHITE else _as_rgb(image)
+
+    @property
+    def cfa(self) -> str | None:  # type: ignore[override]
+        page: Any = self._tiff.pages[0]
+        size, codes = (page.tags.valueof(name, ()) for name in ("CFARepeatPatternDim", "CFAPattern"))
+        plain = page.photometric == CFA and tuple(size) == (2, 2) and len(codes) == 4 and max(codes) < len("RGB")
+        return "".join("RGB"[code] for code in codes) if plain else None
 
     @property
     def bits(self) -> int | None:  # type: ignore[override]
@@ -283,7 +308,7 @@ def _lvpyio() -> Any:
     return lvpyio
 
 
-MIN_IS_WHITE, PALETTE = 0, 3  # photometric interpretations of TIFF
+MIN_IS_WHITE, PALETTE, CFA = 0, 3, 32803  # photometric interpretations of TIFF
 PNG_PALETTE = 3  # colour type
 REDUCED = 1  # bit of NewSubfileType: a thumbnail
 
