@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -76,3 +77,26 @@ def write_photron(
     # what precedes the XML in real files is not text
     header.write_bytes((b"\xff\xfe\x00head\n" if xml else b"") + text.encode())
     return header
+
+
+def write_cine(
+    path: Path, frames: list[bytes], h=H, w=W, depth=16, bits=12, packing=0, compression=0, cfa=0, rate=1000,
+    times=(), first=-40, flip=0, annotation=b"event",
+):  # fmt: skip
+    """A film of Phantom's software: header, BITMAPINFOHEADER, SETUP, tagged blocks, positions, frames."""
+    setup = bytearray(0x1B00)
+    struct.pack_into("<2sH", setup, 140, b"ST", len(setup))
+    for offset, value in ((756, flip), (768, rate), (808, cfa), (896, bits)):
+        struct.pack_into("<I", setup, offset, value)
+    stamps = [1_600_000_000 * 2**32 + round(t * 2**32) for t in times]
+    blocks = struct.pack("<IHH", 8 + 4 * len(frames), 1003, 0) + bytes(4 * len(frames))  # exposures
+    blocks += struct.pack(f"<IHH{len(stamps)}Q", 8 + 8 * len(stamps), 1002, 0, *stamps) if stamps else b""
+    table = 44 + 40 + len(setup) + len(blocks)
+    head = struct.pack("<2s3HiIiI3I8x", b"CI", 44, compression, 1, -5000, 9000, first, len(frames), 44, 84, table)
+    size = len(frames[0])
+    head += struct.pack("<IiiHHIIiiII", 40, w, h, 1, depth, packing, size, 0, 0, 0, 0) + setup + blocks
+    step = 8 + len(annotation)
+    begin = table + 8 * len(frames)
+    positions = [begin + k * (step + size) for k in range(len(frames))]
+    body = b"".join(struct.pack("<I", step) + annotation + struct.pack("<I", len(data)) + data for data in frames)
+    path.write_bytes(head + struct.pack(f"<{len(frames)}q", *positions) + body)
