@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 import os
+import pickle
+import sys
 import time
+from fractions import Fraction
 
 import av
 import numpy as np
 import pytest
+from av.video.frame import PictureType
 
 from imaging_files import packed, write_cine
+from nerif.common.conventions import InputError
 from nerif.imaging.readers.cine import TWELVE_BIT
-from nerif.imaging.readers.frames import Frames
+from nerif.imaging.readers.exposure import full_scale
+from nerif.imaging.readers.frames import Frames, read_each
 from nerif.imaging.readers.open import open_frames
+from nerif.imaging.readers.video import VideoFrames
 from refusals import refused
 
 N, H, W = 5, 6, 16
@@ -34,6 +41,169 @@ def same(frames: Frames, stack: np.ndarray) -> None:
 def by_ffmpeg(path) -> np.ndarray:
     with av.open(str(path)) as film:
         return np.stack([frame.to_ndarray() for frame in film.decode(video=0)])
+
+
+# --- video
+
+
+def write_video(path, images, codec="libx264", pixels="yuv420p", rate=30, options=()) -> None:
+    """A film whose brightness has the values of the images (row, column), or whose colours those of R, G, B."""
+    options = dict(options)
+    with av.open(str(path), "w") as film:
+        stream = film.add_stream(codec, rate=rate, options=options)
+        stream.height, stream.width = images[0].shape[:2]
+        stream.pix_fmt = pixels
+        if codec == "libx264":
+            stream.codec_context.gop_size, stream.codec_context.max_b_frames = 8, 3
+        for i, image in enumerate(images):
+            if image.ndim == 3:
+                frame = av.VideoFrame.from_ndarray(image, format="rgb24").reformat(format=pixels)
+            else:
+                frame = av.VideoFrame(image.shape[1], image.shape[0], pixels)
+                kind, step = image.dtype.newbyteorder(">" if "be" in pixels else "<"), 1 + (pixels == "yuyv422")
+                for k, plane in enumerate(frame.planes):
+                    values = np.full((plane.height, plane.line_size // image.itemsize), 128, kind)
+                    if not k:
+                        values[:, : step * plane.width : step] = image
+                    plane.update(values)
+            frame.pts = i
+            film.mux(stream.encode(frame))
+        film.mux(stream.encode())
+
+
+def moving(n: int, h=48, w=64, top=255) -> np.ndarray:
+    """Stripes that move, so that every frame differs from all others and codecs use reordered frames."""
+    x = np.arange(w) + 3.7 * np.arange(n)[:, None, None] + 5 * np.sin(np.arange(h))[:, None]
+    return np.rint((0.5 + 0.45 * np.sin(x / 5)) * top).astype(np.uint8 if top < 256 else np.uint16)
+
+
+LOSSLESS = (("qp", "0"), ("preset", "fast"))
+
+
+@pytest.mark.parametrize("options", [(), (("x264-params", "open-gop=1"),)], ids=["closed", "open"])
+@pytest.mark.parametrize("suffix", [".mp4", ".mkv", ".mov", ".avi"])
+def test_every_frame_of_a_film_with_reordered_frames(tmp_path, rng, suffix, options):
+    images = moving(50)
+    write_video(tmp_path / f"a{suffix}", images, options=(("qp", "8"), *options))
+    with av.open(str(tmp_path / f"a{suffix}")) as film:
+        decoded = list(film.decode(video=0))
+    assert PictureType.B in {frame.pict_type for frame in decoded}
+    stack = np.stack([np.frombuffer(f.planes[0], np.uint8).reshape(48, -1)[:, :64] for f in decoded])
+    np.testing.assert_allclose(stack, images.astype(float), atol=12)
+    frames = open_frames(tmp_path / f"a{suffix}")
+    same(frames, stack)
+    for i in rng.permutation(50):
+        np.testing.assert_array_equal(frames[i], stack[i])
+    np.testing.assert_allclose(frames.times, np.arange(50) / 30, atol=1e-12)
+    assert frames.white == 235
+    assert "h264" in frames.notes[0]
+    same(pickle.loads(pickle.dumps(frames)), stack)
+
+
+@pytest.mark.parametrize(
+    ("codec", "pixels", "suffix", "top"),
+    [
+        ("rawvideo", "gray", ".avi", 255), ("rawvideo", "yuyv422", ".avi", 255), ("ffv1", "gray", ".mkv", 255),
+        ("ffv1", "gray12le", ".mkv", 4095), ("ffv1", "gray16le", ".avi", 65535), ("rawvideo", "gray16be", ".mov", 65535),
+        ("ffv1", "yuv420p10le", ".mkv", 1023), ("libx264", "yuv420p10le", ".mp4", 1023), ("png", "gray", ".mov", 255),
+    ],
+)  # fmt: skip
+def test_brightness_is_that_stored(tmp_path, codec, pixels, suffix, top):
+    stack = moving(20, top=top)
+    path, options = tmp_path / f"a{suffix}", LOSSLESS if codec == "libx264" else ()
+    write_video(path, stack, codec, pixels, options=options)
+    frames = open_frames(path)
+    same(frames, stack)
+    assert frames.bits == top.bit_length()
+    assert frames.white == (235 << top.bit_length() - 8 if "yu" in pixels else None)
+    assert not any("loss" in note for note in frames.notes) or codec == "libx264"
+
+
+@pytest.mark.parametrize(("codec", "pixels"), [("rawvideo", "bgr24"), ("ffv1", "bgr0"), ("utvideo", "gbrp")])
+def test_colours_of_films_become_luminance(tmp_path, rng, codec, pixels):
+    stack = rng.integers(0, 256, (N, 48, 64, 3)).astype(np.uint8)
+    write_video(tmp_path / "a.avi", stack, codec, pixels)
+    frames = open_frames(tmp_path / "a.avi")
+    same(frames, np.rint(stack @ LUMINANCE).astype(np.uint8))
+    assert frames.white is None
+
+
+def test_a_film_of_constant_rate_has_exact_times_and_others_their_own(tmp_path):
+    write_video(tmp_path / "a.mkv", moving(7), "ffv1", "gray", rate=30)  # times to 1 ms in the file
+    np.testing.assert_allclose(open_frames(tmp_path / "a.mkv").times, np.arange(7) / 30, atol=1e-12)
+    with av.open(str(tmp_path / "b.mkv"), "w") as film:
+        stream = film.add_stream("ffv1", rate=30)
+        stream.width, stream.height, stream.pix_fmt, stream.time_base = 64, 48, "gray", Fraction(1, 1000)
+        stream.codec_context.time_base = Fraction(1, 1000)
+        for image, pts in zip(moving(4), (0, 40, 50, 200), strict=True):
+            frame = av.VideoFrame.from_ndarray(image, format="gray")
+            frame.pts, frame.time_base = pts, Fraction(1, 1000)
+            film.mux(stream.encode(frame))
+        film.mux(stream.encode())
+    np.testing.assert_allclose(open_frames(tmp_path / "b.mkv").times, [0, 0.04, 0.05, 0.2])
+
+
+def test_notes_about_a_video(tmp_path):
+    write_video(tmp_path / "a.avi", moving(4), "mjpeg", "yuvj420p")
+    loss, rate = open_frames("a.avi", tmp_path).notes
+    assert loss.startswith("a.avi: compressed with loss (mjpeg)")
+    assert rate.startswith("a.avi: times by its 30 frames per second")
+    assert open_frames(tmp_path / "a.avi").white is None  # of full range
+    write_video(tmp_path / "b.avi", moving(4), "rawvideo", "gray")
+    (rate,) = open_frames("b.avi[1:]", tmp_path).notes
+    assert "--frame-rate" in rate
+
+
+def test_full_scale_of_limited_range(tmp_path):
+    image = np.minimum(moving(2), 235)
+    write_video(tmp_path / "a.mkv", image, "ffv1", "yuv420p")
+    assert full_scale(open_frames(tmp_path / "a.mkv")) == 235
+    image[0, 3, 4] = 250  # cameras that use the range above
+    write_video(tmp_path / "a.mkv", image, "ffv1", "yuv420p")
+    assert full_scale(open_frames(tmp_path / "a.mkv")) == 255
+
+
+def test_a_film_is_decoded_once_when_read_in_order(tmp_path, monkeypatch):
+    write_video(tmp_path / "a.mp4", moving(50))
+    frames = open_frames(tmp_path / "a.mp4")
+    starts = []
+    start = VideoFrames._start
+    monkeypatch.setattr(VideoFrames, "_start", lambda self, key: (starts.append(key), start(self, key)))
+    for i in range(1, 50):
+        frames.load(i)
+    assert len(starts) == 1
+
+
+@pytest.mark.parametrize("suffix", [".avi", ".mkv"])
+def test_truncated_video(tmp_path, suffix):
+    stack = moving(30)
+    path = tmp_path / f"a{suffix}"
+    write_video(path, stack, "rawvideo" if suffix == ".avi" else "ffv1", "gray")
+    os.truncate(path, path.stat().st_size // 2)
+    frames = open_frames(path.name, tmp_path)
+    assert 5 < len(frames) < 30
+    errors = dict(read_each(frames, range(len(frames))))
+    bad = [i for i, image in errors.items() if isinstance(image, InputError)]
+    assert bad in ([], [len(frames) - 1])
+    for i in set(errors) - set(bad):
+        np.testing.assert_array_equal(errors[i], stack[i])
+    assert any("truncated" in note for note in frames.notes) or suffix == ".mkv"
+
+
+def test_videos_that_cannot_be_read(tmp_path, monkeypatch):
+    write_video(tmp_path / "a.mp4", moving(30))
+    os.truncate(tmp_path / "a.mp4", 2000)  # its index is at the end
+    (tmp_path / "b.avi").write_bytes(b"")
+    (tmp_path / "c.mkv").write_text("no film")
+    for name in ("a.mp4", "b.avi", "c.mkv"):
+        with refused(name):
+            open_frames(name, tmp_path)
+    write_video(tmp_path / "d.avi", moving(4, top=65535), "rawvideo", "gray16le")  # read as colours of 5 bit
+    with pytest.raises(InputError, match=r"^d.avi frame 1: .*16-bit grey AVI"):
+        open_frames("d.avi", tmp_path)[1]
+    monkeypatch.setitem(sys.modules, "av", None)
+    with pytest.raises(InputError, match=r"pip install 'nerif-bost\[video\]'"):
+        open_frames(tmp_path / "d.avi")
 
 
 # --- Phantom

@@ -46,6 +46,8 @@ class Frames(ABC):
     """Recording time of each frame, s; None if the file has none."""
     metadata_bits: int | None = None
     """Effective bits in the metadata of the file."""
+    white: int | None = None
+    """Grey value of a saturated pixel in the metadata, if not the largest of the effective bits."""
     cfa: str | None = None
     """Bayer pattern of raw values in the metadata, such as RGGB: the colours of the first two pixels of the first two
     rows; None if unknown or none."""
@@ -138,7 +140,7 @@ class SelectedFrames(Frames):
 
     def __init__(self, frames: Frames, indices: Sequence[int]) -> None:
         self._frames, self._indices, self.metadata_bits = frames, indices, frames.metadata_bits
-        self.cfa = frames.cfa
+        self.cfa, self.white = frames.cfa, frames.white
         if frames.times is not None:
             self.times = frames.times[list(indices)]
 

@@ -20,11 +20,27 @@ from nerif.imaging.readers.cine import CineFrames
 from nerif.imaging.readers.frames import Frames, SelectedFrames, size_in_words
 from nerif.imaging.readers.image_files import FileFrames
 from nerif.imaging.readers.photron import PhotronFrames
+from nerif.imaging.readers.video import VideoFrames
 
 __all__ = ["FOLDER_SUFFIXES", "open_frames", "read_mask"]
 
 FOLDER_SUFFIXES = (".tif", ".tiff", ".png", ".bmp", ".jpg", ".jpeg", ".im7")
-SINGLE_SUFFIXES = (".cih", ".cihx", ".mraw", ".cine", ".npy", ".npz", ".h5", ".hdf5", ".hdf")
+SINGLE_SUFFIXES = (
+    ".cih",
+    ".cihx",
+    ".mraw",
+    ".cine",
+    ".avi",
+    ".mp4",
+    ".m4v",
+    ".mov",
+    ".mkv",
+    ".npy",
+    ".npz",
+    ".h5",
+    ".hdf5",
+    ".hdf",
+)
 SUFFIXES = (*FOLDER_SUFFIXES, ".vc7", *SINGLE_SUFFIXES)
 SELECTION = re.compile(r"(.+)\[(-?\d+|-?\d*:-?\d*(?::-?\d*)?)\]")
 DATASET = re.compile(r"(.+\.(?:h5|hdf5|hdf|npz)):(.+)", re.IGNORECASE)
@@ -82,6 +98,8 @@ def _open_files(files: list[Path], names: list[str], dataset: str = "") -> Frame
             return PhotronFrames(files[0], names[0])
         case ".cine":
             return CineFrames(files[0], names[0])
+        case ".avi" | ".mp4" | ".m4v" | ".mov" | ".mkv":
+            return VideoFrames(files[0], names[0])
         case ".h5" | ".hdf5" | ".hdf":
             return Hdf5Frames(files[0], names[0], dataset)
         case ".npy" | ".npz":
