@@ -41,8 +41,9 @@ class VideoFrames(Frames):
                 stream = next(iter(film.streams.video), None)
                 context = stream and stream.codec_context
                 if context is None or not context.pix_fmt:
-                    raise InputError("expected a film, got none of a codec that FFmpeg can decode; export it as TIFF, or "
-                                     "as AVI without compression", field=name)  # fmt: skip
+                    raise InputError(
+                        "expected a film that FFmpeg can decode, got another; export it as TIFF", field=name
+                    )
                 tick = float(stream.time_base)
                 self._codec, properties = context.codec.name, int(context.codec.properties)
                 self._rate, self._expected = float(stream.average_rate or 0), stream.frames
@@ -50,9 +51,8 @@ class VideoFrames(Frames):
                 is_ordered = not (properties & REORDERED and film.format.name == "avi")
                 pixels, range_ = av.VideoFormat(context.pix_fmt, 16, 16), context.color_range
         except av.FFmpegError as error:
-            raise InputError(
-                f"cannot be read as a film, truncated or damaged? ({error.strerror})", field=name
-            ) from None
+            text = f"cannot be read as a film, truncated or damaged? ({error.strerror}); copy or export it again"
+            raise InputError(text, field=name) from None
         if not packets:
             raise InputError("expected at least one frame, got none; export it again", field=name)
         self._length, self._is_lossy, self._is_lossless = len(packets), properties & LOSSY, properties & LOSSLESS
@@ -83,14 +83,11 @@ class VideoFrames(Frames):
         notes = []
         if self._is_lossy:
             often = ", as a rule with loss" if self._is_lossless else " with loss"
-            notes.append(f"compressed{often} ({self._codec}), which adds errors to displacements; if you can, export it "
-                         "without loss")  # fmt: skip
+            notes.append(f"compressed{often} ({self._codec}), which adds errors; better export it without loss")
         if self._expected > len(self):
             notes.append(f"has {len(self)} of the {self._expected} frames of its header; truncated? Copy it again")
         if self._rate:
-            notes.append(
-                f"times by its {self._rate:g} frames per second; if recorded at another rate, set --frame-rate"
-            )
+            notes.append(f"times by its {self._rate:g} frames per second; if it was recorded faster, set --frame-rate")
         try:
             if self._frame(0).interlaced_frame:
                 notes.append("interlaced: its even and uneven rows show different instants; record progressive frames")
