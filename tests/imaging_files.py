@@ -34,6 +34,42 @@ def packed(values: np.ndarray, bits: int = 12) -> bytes:
     return bytes(int(text[i : i + 8].ljust(8, "0"), 2) for i in range(0, len(text), 8))
 
 
+def write_packed_tiff(path: Path, images: np.ndarray, bits: int, rows: int, fill: int = 1, order: str = "<") -> None:
+    """Pages of packed values, in strips of `rows` rows, the bits of whose bytes are in the fill order."""
+    out, link = bytearray((b"II*\0" if order == "<" else b"MM\0*") + bytes(4)), 4
+    height, width = images.shape[1:]
+    for image in images:
+        places: list[tuple[int, int]] = []
+        for k in range(0, height, rows):
+            data = b"".join(packed(row, bits) for row in image[k : k + rows])
+            places.append((len(out), len(data)))
+            out += data if fill == 1 else bytes(int(f"{byte:08b}"[::-1], 2) for byte in data)
+        tables = []
+        for table in zip(*places, strict=True):
+            tables.append(table[0] if len(table) == 1 else len(out))
+            out += struct.pack(f"{order}{len(table)}I", *table) if len(table) > 1 else b""
+        offsets, sizes = tables
+        entries = {
+            256: width,
+            257: height,
+            258: bits,
+            259: 1,
+            262: 1,
+            266: fill,
+            273: offsets,
+            277: 1,
+            278: rows,
+            279: sizes,
+        }
+        struct.pack_into(f"{order}I", out, link, len(out))
+        out += struct.pack(f"{order}H", len(entries))
+        for tag, value in entries.items():
+            out += struct.pack(f"{order}HHII", tag, 4, len(places) if tag in (273, 279) else 1, value)
+        link = len(out)
+        out += bytes(4)
+    path.write_bytes(out)
+
+
 CIH = """#Camera Information Header
 Date : 2024/5/3
 Camera Type : FASTCAM SA-Z

@@ -104,7 +104,8 @@ def test_every_frame_of_a_film_with_reordered_frames(tmp_path, rng, suffix, opti
     ("codec", "pixels", "suffix", "top"),
     [
         ("rawvideo", "gray", ".avi", 255), ("rawvideo", "yuyv422", ".avi", 255), ("ffv1", "gray", ".mkv", 255),
-        ("ffv1", "gray12le", ".mkv", 4095), ("ffv1", "gray16le", ".avi", 65535), ("rawvideo", "gray16be", ".mov", 65535),
+        ("ffv1", "gray12le", ".mkv", 4095), ("ffv1", "gray16le", ".avi", 65535),
+        ("rawvideo", "gray16be", ".mov", 65535),
         ("ffv1", "yuv420p10le", ".mkv", 1023), ("libx264", "yuv420p10le", ".mp4", 1023), ("png", "gray", ".mov", 255),
     ],
 )  # fmt: skip

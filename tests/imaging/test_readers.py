@@ -10,13 +10,14 @@ import types
 import zlib
 from pathlib import Path
 
+import cv2
 import h5py
 import numpy as np
 import pytest
 from imageio import v3
 from PIL import Image
 
-from imaging_files import packed, write_cv, write_images, write_photron, write_tiff
+from imaging_files import packed, write_cv, write_images, write_packed_tiff, write_photron, write_tiff
 from nerif.common.conventions import InputError
 from nerif.imaging.readers import image_files
 from nerif.imaging.readers.crop import Crop
@@ -90,17 +91,41 @@ def test_tiff_compressed_by_lzw(tmp_path, stack8):
     same(open_frames(tmp_path / "lzw.tif"), stack8)
 
 
-@pytest.mark.parametrize("bits", [10, 12, 14])
-def test_tiff_with_packed_bits(tmp_path, rng, bits):
-    image = rng.integers(0, 2**bits, (7, 12)).astype(np.uint16)  # rows of whole bytes
-    data = b"".join(packed(row, bits) for row in image)
-    data += bytes(len(data) % 2)
-    tags = [(256, 12), (257, 7), (258, bits), (259, 1), (262, 1), (273, 8), (277, 1), (278, 7), (279, len(data))]
-    ifd = struct.pack("<H", len(tags)) + b"".join(struct.pack("<HHII", k, 4, 1, v) for k, v in tags) + bytes(4)
-    (tmp_path / "p.tif").write_bytes(b"II*\0" + struct.pack("<I", 8 + len(data)) + data + ifd)
-    frames = open_frames(tmp_path / "p.tif")
-    same(frames, image[None])
+@pytest.mark.parametrize("width", [12, 13, 7])  # 10 bit: rows of whole bytes, or not
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("fill", [1, 2])
+@pytest.mark.parametrize("bits", [9, 10, 11, 12, 14, 15])
+def test_tiff_with_packed_bits(tmp_path, rng, bits, fill, order, width):
+    stack = rng.integers(0, 2**bits, (3, 8, width)).astype(np.uint16)
+    path = tmp_path / "p.tif"
+    write_packed_tiff(path, stack, bits, 3, fill, order)
+    frames = open_frames(path)
+    same(frames, stack)
     assert frames.bits == bits
+    if bits in (10, 12, 14) and order == "<":  # another reader, which shifts the values to the top
+        _, images = cv2.imreadmulti(str(path), flags=cv2.IMREAD_UNCHANGED)
+        np.testing.assert_array_equal(np.stack(images) >> 16 - bits, stack)
+
+
+def test_truncated_packed_tiff(tmp_path, rng):
+    stack = rng.integers(0, 1024, (2, 8, 12)).astype(np.uint16)
+    write_packed_tiff(tmp_path / "p.tif", stack, 10, 8)
+    data = bytearray((tmp_path / "p.tif").read_bytes())
+    end = len(data)
+    struct.pack_into("<I", data, end - 4 - 4 * 12 + 8, end - 30)  # the offset of the second page
+    (tmp_path / "p.tif").write_bytes(data)
+    frames = open_frames("p.tif", tmp_path)
+    np.testing.assert_array_equal(frames[0], stack[0])
+    with refused("p.tif frame 1"):
+        frames[1]
+
+
+def test_packed_tiff_of_a_camera(tmp_path):
+    path = Path("/work/shared/data/surface/circular_1.tif")
+    if not path.exists():
+        pytest.skip("no shared data")
+    frames = open_frames(path)
+    assert (frames.bits, frames.shape, frames[0].min(), frames[0].max()) == (10, (1024, 1024), 1, 1023)
 
 
 def test_bits_of_metadata(tmp_path, stack12):
@@ -468,8 +493,14 @@ def test_reference_and_flow_have_one_size_and_depth(tmp_path, stack12, stack8):
         ("zzz", "zzz", "folder$"),
         ("nowhere/at/all.tif", "nowhere/at/all.tif", "no such"),
         ("empty", "empty", "is it the right folder"),
-        ("arrays", "arrays", "name the file, such as 'arrays/a.npy'"),
-        ("notes.txt", "notes.txt", "'.txt'"),
+        ("arrays", "arrays", "got 2 files ending in .npy; name one file, such as 'arrays/a.npy'"),
+        (
+            "films",
+            "films",
+            "got 3 files ending in .wmv, 1 file without ending, 1 folder; .* export other formats as TIFF",
+        ),
+        ("films/*.wmv", "films/*.wmv", "got 2 files ending in .wmv; .* TIFF"),
+        ("notes.txt", "notes.txt", "'.txt'; export other formats as TIFF"),
         ("arrays/*.npy", "arrays/a.npy", "one recording"),
     ],
 )
@@ -477,6 +508,9 @@ def test_missing_files(tmp_path, stack8, spec, field, remedy):
     write_images(tmp_path / "cam1", stack8)
     for name in ("empty", "arrays"):
         (tmp_path / name).mkdir()
+    (tmp_path / "films" / "old").mkdir(parents=True)
+    for name in ("1.wmv", "2.WMV", "3.wmv", "readme", ".hidden"):
+        (tmp_path / "films" / name).touch()
     for name in "ab":
         np.save(tmp_path / "arrays" / f"{name}.npy", stack8)
     (tmp_path / "notes.txt").touch()

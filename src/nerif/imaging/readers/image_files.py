@@ -17,6 +17,7 @@ import numpy as np
 from nerif.common.conventions import InputError
 from nerif.common.installation import install
 from nerif.imaging.readers.frames import Frames
+from nerif.imaging.readers.packed import unpack
 
 __all__ = ["FileFrames"]
 
@@ -155,7 +156,7 @@ class Tiff(ImageFile):
             if 1 < page.bitspersample < 8:
                 raise _too_few_bits(page.bitspersample)
             try:
-                image = page.asarray()
+                image = self._read_packed(page) if _is_packed(page) else page.asarray()
             except (ValueError, NotImplementedError) as error:
                 if "imagecodecs" not in str(error):
                     raise
@@ -176,8 +177,22 @@ class Tiff(ImageFile):
         image = image.reshape(page.shape)
         return _inverted(image, page.bitspersample) if page.photometric == MIN_IS_WHITE else image
 
+    def _read_packed(self, page: Any) -> np.ndarray:
+        """A page of 9 to 15 bit; each row begins with a new byte."""
+        (height, width), bits = page.shape, page.bitspersample
+        row = -(-width * bits // 8)
+        strips = zip(page.databytecounts, page.dataoffsets, strict=True)
+        data = np.concatenate([np.fromfile(self._path, np.uint8, size, offset=begin) for size, begin in strips])
+        if len(data) < height * row:
+            raise ValueError(f"{len(data)} bytes of {height * row}")
+        if page.fillorder == LOWEST_BIT_FIRST:
+            data = np.packbits(np.unpackbits(data, bitorder="little"))
+        padded = np.zeros((height, row + -row % bits), np.uint8)  # rows of whole values
+        padded[:, :row] = data[: height * row].reshape(height, row)
+        return unpack(padded.ravel(), bits, padded.size * 8 // bits).reshape(height, -1)[:, :width]
+
     def _read_by_opencv(self, i: int, page: Any) -> np.ndarray:
-        """Compressed and packed pages that tifffile cannot decode; OpenCV shifts packed bits to the top and turns."""
+        """Compressed pages that tifffile cannot decode; OpenCV shifts packed bits to the top and turns."""
         import cv2
 
         _, images = cv2.imreadmulti(str(self._path), start=i, count=1, flags=cv2.IMREAD_UNCHANGED)
@@ -308,6 +323,7 @@ def _lvpyio() -> Any:
     return lvpyio
 
 
+NO_COMPRESSION, LOWEST_BIT_FIRST = 1, 2  # compression and fill order of TIFF
 MIN_IS_WHITE, PALETTE, CFA = 0, 3, 32803  # photometric interpretations of TIFF
 PNG_PALETTE = 3  # colour type
 REDUCED = 1  # bit of NewSubfileType: a thumbnail
@@ -321,6 +337,12 @@ TURNED: dict[int, Callable[[np.ndarray], np.ndarray]] = {
 
 def _is_reduced(page: Any) -> bool:
     return bool(int(page.tags.valueof("NewSubfileType", 0) or 0) & REDUCED) if hasattr(page, "tags") else False
+
+
+def _is_packed(page: Any) -> bool:
+    """Whether grey values of 9 to 15 bit follow one another, in strips."""
+    plain = page.compression == NO_COMPRESSION and page.samplesperpixel == 1 and not page.is_tiled
+    return plain and 8 < page.bitspersample < 16
 
 
 def _images_of_imagej(tiff: Any) -> int:

@@ -41,9 +41,7 @@ class VideoFrames(Frames):
                 stream = next(iter(film.streams.video), None)
                 context = stream and stream.codec_context
                 if context is None or not context.pix_fmt:
-                    raise InputError(
-                        "expected a film that FFmpeg can decode, got another; export it as TIFF", field=name
-                    )
+                    raise InputError("expected a film that FFmpeg can decode; export the frames as TIFF", field=name)
                 tick = float(stream.time_base)
                 self._codec, properties = context.codec.name, int(context.codec.properties)
                 self._rate, self._expected = float(stream.average_rate or 0), stream.frames
