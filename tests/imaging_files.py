@@ -48,19 +48,8 @@ def write_packed_tiff(path: Path, images: np.ndarray, bits: int, rows: int, fill
         for table in zip(*places, strict=True):
             tables.append(table[0] if len(table) == 1 else len(out))
             out += struct.pack(f"{order}{len(table)}I", *table) if len(table) > 1 else b""
-        offsets, sizes = tables
-        entries = {
-            256: width,
-            257: height,
-            258: bits,
-            259: 1,
-            262: 1,
-            266: fill,
-            273: offsets,
-            277: 1,
-            278: rows,
-            279: sizes,
-        }
+        entries = dict(zip((256, 257, 258, 259, 262, 266), (width, height, bits, 1, 1, fill), strict=True))
+        entries |= {273: tables[0], 277: 1, 278: rows, 279: tables[1]}
         struct.pack_into(f"{order}I", out, link, len(out))
         out += struct.pack(f"{order}H", len(entries))
         for tag, value in entries.items():

@@ -27,6 +27,7 @@ from nerif.imaging.readers.views import View
 from refusals import refused
 
 N, H, W = 4, 7, 10
+PACKED = Path(__file__).parents[3] / "shared" / "data" / "surface" / "circular_1.tif"
 LUMINANCE = [0.299, 0.587, 0.114]
 
 
@@ -120,11 +121,9 @@ def test_truncated_packed_tiff(tmp_path, rng):
         frames[1]
 
 
-def test_packed_tiff_of_a_camera(tmp_path):
-    path = Path("/work/shared/data/surface/circular_1.tif")
-    if not path.exists():
-        pytest.skip("no shared data")
-    frames = open_frames(path)
+@pytest.mark.skipif(not PACKED.is_file(), reason="shared/data is missing")
+def test_packed_tiff_of_a_camera():
+    frames = open_frames(PACKED)
     assert (frames.bits, frames.shape, frames[0].min(), frames[0].max()) == (10, (1024, 1024), 1, 1023)
 
 

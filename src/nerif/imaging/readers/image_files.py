@@ -181,8 +181,9 @@ class Tiff(ImageFile):
         """A page of 9 to 15 bit; each row begins with a new byte."""
         (height, width), bits = page.shape, page.bitspersample
         row = -(-width * bits // 8)
-        strips = zip(page.databytecounts, page.dataoffsets, strict=True)
-        data = np.concatenate([np.fromfile(self._path, np.uint8, size, offset=begin) for size, begin in strips])
+        strips = zip(page.dataoffsets, page.databytecounts, strict=True)
+        handle = self._tiff.filehandle
+        data = np.frombuffer(b"".join(handle.read(size) for begin, size in strips if handle.seek(begin) >= 0), np.uint8)
         if len(data) < height * row:
             raise ValueError(f"{len(data)} bytes of {height * row}")
         if page.fillorder == LOWEST_BIT_FIRST:
