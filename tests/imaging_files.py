@@ -59,6 +59,31 @@ def write_packed_tiff(path: Path, images: np.ndarray, bits: int, rows: int, fill
     path.write_bytes(out)
 
 
+def write_b16(path: Path, image: np.ndarray, comment: bytes = b"", extended: bool = False) -> None:
+    """An image of PCO's Camware."""
+    rest = (struct.pack("<27i", -1, *range(26)) if extended else struct.pack("<i", 0)) + comment
+    height, width = image.shape
+    head = struct.pack("<4s4i", b"PCO-", 20 + len(rest) + image.nbytes, 20 + len(rest), width, height)
+    path.write_bytes(head + rest + image.astype("<u2").tobytes())
+
+
+def stamped(image: np.ndarray, shift: int = 0) -> np.ndarray:
+    """An image with a time stamp of PCO in its first pixels, image 31 of 2024-05-03 12:34:56.789012."""
+    digits = "0000003120240503123456789012"
+    image = image.copy()
+    image[0, :14] = [int(digits[k : k + 2], 16) << shift for k in range(0, 28, 2)]
+    return image
+
+
+def write_dng(path: Path, mosaic: np.ndarray, codes: bytes, black: int, white: int) -> None:
+    """A raw image of a camera, with the codes (R 0, G 1, B 2) of the colours of its pattern."""
+    identity = tuple(number for k in range(9) for number in (int(k % 4 == 0), 1))
+    tags = [(50706, "B", 4, (1, 4, 0, 0)), (50708, "s", 0, "Camera"), (33421, "H", 2, (2, 2)), (33422, "B", 4, codes),
+            (50713, "H", 2, (2, 2)), (50714, "H", 4, (black,) * 4), (50717, "H", 1, white), (50721, "2i", 9, identity),
+            (50728, "2I", 3, (1, 1) * 3), (50778, "H", 1, 21)]  # fmt: skip
+    write_tiff(path, mosaic, photometric="cfa", extratags=[(*tag, True) for tag in tags], metadata=None)
+
+
 CIH = """#Camera Information Header
 Date : 2024/5/3
 Camera Type : FASTCAM SA-Z

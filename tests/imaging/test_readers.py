@@ -17,7 +17,17 @@ import pytest
 from imageio import v3
 from PIL import Image
 
-from imaging_files import packed, write_cv, write_images, write_packed_tiff, write_photron, write_tiff
+from imaging_files import (
+    packed,
+    stamped,
+    write_b16,
+    write_cv,
+    write_dng,
+    write_images,
+    write_packed_tiff,
+    write_photron,
+    write_tiff,
+)  # fmt: skip
 from nerif.common.conventions import InputError
 from nerif.imaging.readers import image_files
 from nerif.imaging.readers.crop import Crop
@@ -266,6 +276,67 @@ def test_photron_needs_both_files(tmp_path):
     (tmp_path / "rec.cih").write_text("nothing of use\n")
     with refused("rec.cih"):
         open_frames("rec.cih", tmp_path)
+
+
+# --- PCO
+
+
+@pytest.mark.parametrize("extended", [False, True])
+def test_b16_of_pco(tmp_path, stack12, extended):
+    for i, image in enumerate(stack12):
+        write_b16(tmp_path / f"a{i}.b16", image, b"a comment" * i, extended)
+    same(open_frames(tmp_path), stack12)
+    data = (tmp_path / "a1.b16").read_bytes()
+    (tmp_path / "a1.b16").write_bytes(data[:-1])
+    (tmp_path / "a2.b16").write_bytes(b"BM" + data[2:])
+    (tmp_path / "a3.b16").write_bytes(b"")
+    good, errors = good_frames(open_frames(".", tmp_path))
+    assert (good, list(errors)) == ([0], ["a1.b16", "a2.b16", "a3.b16"])
+
+
+@pytest.mark.parametrize("shift", [0, 2, 4])
+def test_time_stamps_of_pco_are_noted(tmp_path, rng, shift):
+    image = stamped(rng.integers(0, 65536, (H, 20)).astype(np.uint16), shift)
+    write_b16(tmp_path / "a.b16", image)
+    write_tiff(tmp_path / "b.tif", np.stack([image] * 2), photometric="minisblack")
+    for name in ("a.b16", "b.tif"):
+        (note,) = open_frames(name, tmp_path).notes
+        assert note.startswith(f"{name}: ")
+        assert "2024-05-03 12:34:56" in note
+        np.testing.assert_array_equal(open_frames(name, tmp_path)[0], image)
+
+
+@pytest.mark.parametrize("value", [0, 5, 0x11])
+def test_grey_values_are_no_time_stamps(tmp_path, rng, value):
+    for i, image in enumerate((np.full((H, 20), value, np.uint16), stamped(np.zeros((H, 20), np.uint16))[:, :12])):
+        write_tiff(tmp_path / f"{i}.tif", image)
+        assert open_frames(tmp_path / f"{i}.tif").notes == ()
+
+
+# --- photo cameras
+
+
+@pytest.mark.parametrize(("codes", "cfa"), [(bytes([0, 1, 1, 2]), "RGGB"), (bytes([1, 0, 2, 1]), "GRBG")])
+def test_raw_images_of_photo_cameras(tmp_path, rng, codes, cfa):
+    stack = rng.integers(60, 4001, (2, 60, 80)).astype(np.uint16)
+    stack[:, 3, 5] = 4000
+    for i, image in enumerate(stack):
+        write_dng(tmp_path / f"IMG_{i}.dng", image, codes, 64, 4000)
+    frames = open_frames(".", tmp_path)
+    for i, image in enumerate(stack):
+        np.testing.assert_array_equal(frames.load(i), np.maximum(image, 64) - 64)  # less the black level
+    assert (len(frames), frames.cfa, frames.bits, frames.white, frames.name(1)) == (2, cfa, 12, 3936, "IMG_1.dng")
+    assert frames.notes == ()
+    (tmp_path / "IMG_2.dng").write_bytes((tmp_path / "IMG_1.dng").read_bytes()[:3000])
+    with refused("IMG_2.dng"):
+        open_frames("IMG_2.dng", tmp_path)[0]
+
+
+def test_raw_images_without_their_package(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "rawpy", None)
+    (tmp_path / "a.NEF").touch()
+    with pytest.raises(InputError, match=r"pip install 'nerif-bost\[raw\]', or export"):
+        open_frames(tmp_path / "a.NEF")
 
 
 # --- LaVision

@@ -140,7 +140,7 @@ class SelectedFrames(Frames):
 
     def __init__(self, frames: Frames, indices: Sequence[int]) -> None:
         self._frames, self._indices, self.metadata_bits = frames, indices, frames.metadata_bits
-        self.cfa, self.white = frames.cfa, frames.white
+        self.white, self.cfa = frames.white, frames.cfa
         if frames.times is not None:
             self.times = frames.times[list(indices)]
 

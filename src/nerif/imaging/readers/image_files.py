@@ -1,25 +1,29 @@
-"""Frames in image files, one or more in each: TIFF, PNG, BMP, JPEG, LaVision."""
+"""Frames in image files, one or more in each: TIFF, PNG, BMP, JPEG, LaVision, and those of other modules."""
 
 from __future__ import annotations
 
 import logging
 import re
 import weakref
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 
 from nerif.common.conventions import InputError
 from nerif.common.installation import install
+from nerif.imaging.readers.camera_raw import RAW_SUFFIXES, CameraRaw
 from nerif.imaging.readers.frames import Frames
+from nerif.imaging.readers.image_file import ImageFile
 from nerif.imaging.readers.packed import unpack
+from nerif.imaging.readers.pco import B16, note_of_time_stamp
 
-__all__ = ["FileFrames"]
+__all__ = ["OPENERS", "FileFrames"]
+
+Value = TypeVar("Value")
 
 
 class FileFrames(Frames):
@@ -30,11 +34,10 @@ class FileFrames(Frames):
         self._last: tuple[int, ImageFile] | None = None
         counts: list[int] = []
         for k, path in enumerate(files):
-            lavision = _opener(path) is LaVision
-            if lavision:
-                _lvpyio()
+            opener = _opener(path)
+            opener.check_package()
             # to count the images of a LaVision file is to read it: all are taken to have as many as the first
-            counts.append(counts[0] if lavision and counts else self._count(k))
+            counts.append(counts[0] if opener is LaVision and counts else self._count(k))
         self._counts = counts
         self._places = [(k, i) for k, count in enumerate(counts) for i in range(count)]
 
@@ -68,49 +71,30 @@ class FileFrames(Frames):
         except InputError as error:
             raise error.inside(self.name(i)) from None
 
-    @cached_property
-    def _metadata(self) -> tuple[int | None, str | None, tuple[str, ...]]:
-        """Bits, Bayer pattern and notes of the first readable file."""
-        for k in range(len(self._files)):
+    def _metadata(self, read: Callable[[ImageFile, str], Value], default: Value) -> Value:
+        """Metadata of the first readable file."""
+        for k, name in enumerate(self._names):
             try:
-                file = self._open(k)
-                return file.bits, file.cfa, tuple(f"{self._names[k]}: {note}" for note in file.notes)
+                return read(self._open(k), name)
             except Exception:  # reported when the frame is read
                 continue
-        return None, None, ()
+        return default
 
-    @property
+    @cached_property
     def metadata_bits(self) -> int | None:  # type: ignore[override]
-        return self._metadata[0]
+        return self._metadata(lambda file, _: file.bits, None)
 
-    @property
+    @cached_property
+    def white(self) -> int | None:  # type: ignore[override]
+        return self._metadata(lambda file, _: file.white, None)
+
+    @cached_property
     def cfa(self) -> str | None:  # type: ignore[override]
-        return self._metadata[1]
+        return self._metadata(lambda file, _: file.cfa, None)
 
-    @property
+    @cached_property
     def notes(self) -> tuple[str, ...]:  # type: ignore[override]
-        return self._metadata[2]
-
-
-class ImageFile(ABC):
-    """An open file of images."""
-
-    bits: int | None = None
-    """Effective bits in the metadata."""
-    cfa: str | None = None
-    """Bayer pattern in the metadata."""
-    notes: tuple[str, ...] = ()
-    """Warnings about the file."""
-
-    @abstractmethod
-    def __init__(self, path: Path) -> None: ...
-
-    def __len__(self) -> int:
-        return 1
-
-    @abstractmethod
-    def read(self, i: int) -> np.ndarray:
-        """Return image `i` as stored; channels, if any, as R, G, B."""
+        return self._metadata(lambda file, name: tuple(f"{name}: {note}" for note in file.notes), ())
 
 
 class Tiff(ImageFile):
@@ -181,9 +165,8 @@ class Tiff(ImageFile):
         """A page of 9 to 15 bit; each row begins with a new byte."""
         (height, width), bits = page.shape, page.bitspersample
         row = -(-width * bits // 8)
-        strips = zip(page.dataoffsets, page.databytecounts, strict=True)
-        handle = self._tiff.filehandle
-        data = np.frombuffer(b"".join(handle.read(size) for begin, size in strips if handle.seek(begin) >= 0), np.uint8)
+        strips = self._tiff.filehandle.read_segments(page.dataoffsets, page.databytecounts)
+        data = np.frombuffer(b"".join(strip or b"" for strip, _ in strips), np.uint8)
         if len(data) < height * row:
             raise ValueError(f"{len(data)} bytes of {height * row}")
         if page.fillorder == LOWEST_BIT_FIRST:
@@ -204,6 +187,11 @@ class Tiff(ImageFile):
             image = TURNED[orientation](image)
         image = np.right_shift(image, 16 - bits) if 8 < bits < 16 else image
         return _inverted(image, bits) if page.photometric == MIN_IS_WHITE else _as_rgb(image)
+
+    @property
+    def notes(self) -> tuple[str, ...]:  # type: ignore[override]
+        page: Any = self._tiff.pages[0]
+        return note_of_time_stamp(self.read(0)) if page.bitspersample == 16 and page.samplesperpixel == 1 else ()
 
     @property
     def cfa(self) -> str | None:  # type: ignore[override]
@@ -304,6 +292,10 @@ class LaVision(ImageFile):
                 raise InputError("expected images, got vectors; give the .im7 files they were computed from")
             self._planes += list(frame.components["PIXEL"].planes)
 
+    @staticmethod
+    def check_package() -> None:
+        _lvpyio()
+
     def __len__(self) -> int:
         return len(self._planes)
 
@@ -362,7 +354,7 @@ def _inverted(image: np.ndarray, bits: int) -> np.ndarray:
 
 OPENERS: dict[str, type[ImageFile]] = {
     ".tif": Tiff, ".tiff": Tiff, ".png": Png, ".bmp": Image, ".jpg": Image, ".jpeg": Image,
-    ".im7": LaVision, ".vc7": LaVision,
+    ".im7": LaVision, ".vc7": LaVision, ".b16": B16, **dict.fromkeys(RAW_SUFFIXES, CameraRaw),
 }  # fmt: skip
 
 
