@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import pickle
+import struct
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from fractions import Fraction
 
 import av
@@ -127,6 +129,51 @@ def test_colours_of_films_become_luminance(tmp_path, rng, codec, pixels):
     frames = open_frames(tmp_path / "a.avi")
     same(frames, np.rint(stack @ LUMINANCE).astype(np.uint8))
     assert frames.white is None
+
+
+def write_dib(path, images: np.ndarray, palette: np.ndarray, sign: int) -> None:
+    """An AVI of Windows' grey bitmaps, with a palette before the first one; from the bottom where sign is 1."""
+
+    def chunk(name: bytes, data: bytes) -> bytes:
+        return name + struct.pack("<I", len(data)) + data + bytes(len(data) % 2)
+
+    n, h, w = images.shape
+    row = w + -w % 4
+    frames = [b"".join(line.tobytes().ljust(row, b"\0") for line in image[::-sign]) for image in images]
+    bitmap = struct.pack("<IiiHHIIiiII", 40, w, sign * h, 1, 8, 0, row * h, 0, 0, 256, 0) + palette.tobytes()
+    stream = struct.pack("<4s4s10I4h", b"vids", b"DIB ", 0, 0, 0, 1, 25, 0, n, row * h, 0, 0, 0, 0, w, h)
+    head = struct.pack("<14I", 40000, 0, 0, 16, n, 0, 1, row * h, w, h, 0, 0, 0, 0)
+    streams = chunk(b"LIST", b"strl" + chunk(b"strh", stream) + chunk(b"strf", bitmap))
+    body = b"AVI " + chunk(b"LIST", b"hdrl" + chunk(b"avih", head) + streams)
+    body += chunk(b"LIST", b"movi" + b"".join(chunk(b"00db", frame) for frame in frames))
+    entries = (struct.pack("<4s3I", b"00db", 16, 4 + k * (8 + row * h + row * h % 2), row * h) for k in range(n))
+    path.write_bytes(chunk(b"RIFF", body + chunk(b"idx1", b"".join(entries))))
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize("width", [16, 17, 18])
+def test_avi_of_windows_bitmaps(tmp_path, rng, sign, width):
+    stack = rng.integers(0, 256, (4, 9, width)).astype(np.uint8)
+    palette = np.repeat(np.arange(255, -1, -1, dtype=np.uint8), 4)  # dark and bright exchanged
+    write_dib(tmp_path / "a.avi", stack, palette, sign)
+    same(open_frames(tmp_path / "a.avi"), 255 - stack)
+    np.testing.assert_array_equal(open_frames(tmp_path / "a.avi").single(2), 255 - stack[2])  # at once
+
+
+def test_film_stored_from_the_bottom(tmp_path, rng):
+    stack = rng.integers(0, 256, (3, H, W)).astype(np.uint8)
+    write_cine(tmp_path / "a.cine", [image[::-1].tobytes() for image in stack], H, W, 8, 8)
+    same(VideoFrames(tmp_path / "a.cine", "a.cine"), stack)  # FFmpeg has it with a negative step between rows
+
+
+def test_a_film_is_read_by_several_threads(tmp_path):
+    stack = moving(20)
+    write_video(tmp_path / "a.mkv", stack, "ffv1", "gray")
+    frames = open_frames(tmp_path / "a.mkv")
+    numbers = [*range(20), *range(19, -1, -1)] * 3
+    with ThreadPoolExecutor(4) as pool:
+        for i, image in zip(numbers, pool.map(frames.load, numbers), strict=True):
+            np.testing.assert_array_equal(image, stack[i])
 
 
 def test_a_film_of_constant_rate_has_exact_times_and_others_their_own(tmp_path):

@@ -25,7 +25,7 @@ class ImageFile(ABC):
     @abstractmethod
     def __init__(self, path: Path) -> None: ...
 
-    @staticmethod
+    @staticmethod  # noqa: B027 (most need none)
     def check_package() -> None:
         """Raise InputError if an optional package that reads these files is not installed."""
 

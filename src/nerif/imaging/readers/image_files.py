@@ -165,7 +165,7 @@ class Tiff(ImageFile):
         """A page of 9 to 15 bit; each row begins with a new byte."""
         (height, width), bits = page.shape, page.bitspersample
         row = -(-width * bits // 8)
-        strips = self._tiff.filehandle.read_segments(page.dataoffsets, page.databytecounts)
+        strips: Any = self._tiff.filehandle.read_segments(page.dataoffsets, page.databytecounts)
         data = np.frombuffer(b"".join(strip or b"" for strip, _ in strips), np.uint8)
         if len(data) < height * row:
             raise ValueError(f"{len(data)} bytes of {height * row}")

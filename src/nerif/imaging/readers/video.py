@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
@@ -35,10 +36,11 @@ class VideoFrames(Frames):
         self._film: Any = None
         self._decoded: Iterator[Any] = iter(())
         self._next = 0
+        self._lock = threading.Lock()  # of the decoder
         av = _av()
         try:
             with av.open(f"file:{path}") as film:
-                stream = next(iter(film.streams.video), None)
+                stream: Any = next(iter(film.streams.video), None)
                 context = stream and stream.codec_context
                 if context is None or not context.pix_fmt:
                     raise InputError("expected a film that FFmpeg can decode; export the frames as TIFF", field=name)
@@ -87,7 +89,9 @@ class VideoFrames(Frames):
         if self._rate:
             notes.append(f"times by its {self._rate:g} frames per second; if it was recorded faster, set --frame-rate")
         try:
-            if self._frame(0).interlaced_frame:
+            with self._lock:
+                is_interlaced = self._frame(0).interlaced_frame
+            if is_interlaced:
                 notes.append("interlaced: its even and uneven rows show different instants; record progressive frames")
         except Exception:  # reported when the frame is read
             pass
@@ -95,7 +99,10 @@ class VideoFrames(Frames):
 
     def __getstate__(self) -> dict[str, Any]:
         """State for another process: all but the decoder."""
-        return {**self.__dict__, "_film": None, "_decoded": iter(())}
+        return {key: value for key, value in self.__dict__.items() if key not in ("_film", "_decoded", "_lock")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state, _film=None, _decoded=iter(()), _lock=threading.Lock())
 
     def __len__(self) -> int:
         return self._length
@@ -104,7 +111,8 @@ class VideoFrames(Frames):
         return f"{self._name} frame {i}"
 
     def load(self, i: int) -> np.ndarray:
-        frame = self._frame(i)
+        with self._lock:
+            frame = self._frame(i)
         if frame.is_corrupt:
             raise ValueError("its data are incomplete")
         return _brightness(frame, self.name(i))
@@ -139,6 +147,7 @@ class VideoFrames(Frames):
         self._film = _av().open(f"file:{self._path}")
         stream = self._film.streams.video[0]
         if key:
+            next(self._film.decode(stream))  # has the palette of all frames, if there is one
             self._film.seek(self._keys[key], stream=stream)
         self._decoded, self._next = self._film.decode(stream), key
 
@@ -169,6 +178,8 @@ def _brightness(frame: Any, name: str) -> np.ndarray:
         frame = frame.reformat(format="yuv444p" if bits == 8 else "yuv444p16le")
     kind = np.dtype("u1" if bits == 8 else ">u2" if pixels.is_big_endian else "<u2")
     plane = frame.planes[0]
+    if plane.line_size < 0:  # stored from the bottom, which this method of PyAV alone regards
+        return frame.to_ndarray()[: plane.height, : plane.width]
     return np.frombuffer(plane, kind).reshape(plane.height, -1)[:, : plane.width]
 
 
