@@ -58,15 +58,16 @@ class VideoFrames(Frames):
         self._length, self._is_lossy, self._is_lossless = len(packets), properties & LOSSY, properties & LOSSLESS
         stamps = sorted({pts for pts, _, _ in packets if pts is not None})
         self._stamps = np.array(stamps) if is_ordered and len(stamps) == len(packets) else None
-        self._keys = {0: 0}  # times to seek, by the number of the frame
+        keys = {0: 0}  # times to seek, by the number of the frame
         if self._stamps is not None:
             numbers = {pts: i for i, pts in enumerate(stamps)}
-            self._keys |= {numbers[pts]: pts if dts is None else dts for pts, dts, is_key in packets if pts and is_key}
+            keys |= {numbers[pts]: pts if dts is None else dts for pts, dts, is_key in packets if pts and is_key}
+        self._keys, self._key_numbers = keys, np.array(sorted(keys))
         self._set_times(tick)
         bits = pixels.components[0].bits
         self.metadata_bits = bits if 8 <= bits <= 16 else None
-        is_yuv = not (pixels.is_rgb or pixels.has_palette) and len(pixels.components) > 2
-        if range_ == LIMITED_RANGE or (is_yuv and range_ != FULL_RANGE):
+        is_limited = range_ == LIMITED_RANGE or (range_ != FULL_RANGE and len(pixels.components) > 2)
+        if self.metadata_bits and is_limited and not (pixels.is_rgb or pixels.has_palette):
             self.white = LIMITED_WHITE << (bits - 8)
 
     def _set_times(self, tick: float) -> None:
@@ -119,7 +120,7 @@ class VideoFrames(Frames):
 
     def _frame(self, i: int) -> Any:
         """Decode up to frame `i`: from where the decoder is, from the key frame before it, or from the first one."""
-        key = max(k for k in self._keys if k <= i)
+        key = int(self._key_numbers[np.searchsorted(self._key_numbers, i, "right") - 1])
         starts = [key, 0]
         if self._film is not None and key <= self._next <= i:
             starts.insert(0, self._next)
@@ -128,7 +129,11 @@ class VideoFrames(Frames):
                 if start != self._next or self._film is None:
                     self._start(start)
                 for frame in self._decoded:
-                    number = self._next if self._stamps is None else int(np.searchsorted(self._stamps, frame.pts))
+                    number = self._next
+                    if self._stamps is not None:
+                        number = int(np.searchsorted(self._stamps[:-1], frame.pts))
+                        if self._stamps[number] != frame.pts:
+                            continue
                     self._next = number + 1
                     if number == i:
                         return frame
