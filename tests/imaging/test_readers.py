@@ -10,13 +10,24 @@ import types
 import zlib
 from pathlib import Path
 
+import cv2
 import h5py
 import numpy as np
 import pytest
 from imageio import v3
 from PIL import Image
 
-from imaging_files import packed, write_cv, write_images, write_photron, write_tiff
+from imaging_files import (
+    packed,
+    stamped,
+    write_b16,
+    write_cv,
+    write_dng,
+    write_images,
+    write_packed_tiff,
+    write_photron,
+    write_tiff,
+)  # fmt: skip
 from nerif.common.conventions import InputError
 from nerif.imaging.readers import image_files
 from nerif.imaging.readers.crop import Crop
@@ -26,6 +37,7 @@ from nerif.imaging.readers.views import View
 from refusals import refused
 
 N, H, W = 4, 7, 10
+PACKED = Path(__file__).parents[3] / "shared" / "data" / "surface" / "circular_1.tif"
 LUMINANCE = [0.299, 0.587, 0.114]
 
 
@@ -90,17 +102,39 @@ def test_tiff_compressed_by_lzw(tmp_path, stack8):
     same(open_frames(tmp_path / "lzw.tif"), stack8)
 
 
-@pytest.mark.parametrize("bits", [10, 12, 14])
-def test_tiff_with_packed_bits(tmp_path, rng, bits):
-    image = rng.integers(0, 2**bits, (7, 12)).astype(np.uint16)  # rows of whole bytes
-    data = b"".join(packed(row, bits) for row in image)
-    data += bytes(len(data) % 2)
-    tags = [(256, 12), (257, 7), (258, bits), (259, 1), (262, 1), (273, 8), (277, 1), (278, 7), (279, len(data))]
-    ifd = struct.pack("<H", len(tags)) + b"".join(struct.pack("<HHII", k, 4, 1, v) for k, v in tags) + bytes(4)
-    (tmp_path / "p.tif").write_bytes(b"II*\0" + struct.pack("<I", 8 + len(data)) + data + ifd)
-    frames = open_frames(tmp_path / "p.tif")
-    same(frames, image[None])
+@pytest.mark.parametrize("width", [12, 13, 7])  # 10 bit: rows of whole bytes, or not
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("fill", [1, 2])
+@pytest.mark.parametrize("bits", [9, 10, 11, 12, 14, 15])
+def test_tiff_with_packed_bits(tmp_path, rng, bits, fill, order, width):
+    stack = rng.integers(0, 2**bits, (3, 8, width)).astype(np.uint16)
+    path = tmp_path / "p.tif"
+    write_packed_tiff(path, stack, bits, 3, fill, order)
+    frames = open_frames(path)
+    same(frames, stack)
     assert frames.bits == bits
+    if bits in (10, 12, 14) and order == "<":  # another reader, which shifts the values to the top
+        _, images = cv2.imreadmulti(str(path), flags=cv2.IMREAD_UNCHANGED)
+        np.testing.assert_array_equal(np.stack(images) >> 16 - bits, stack)
+
+
+def test_truncated_packed_tiff(tmp_path, rng):
+    stack = rng.integers(0, 1024, (2, 8, 12)).astype(np.uint16)
+    write_packed_tiff(tmp_path / "p.tif", stack, 10, 8)
+    data = bytearray((tmp_path / "p.tif").read_bytes())
+    end = len(data)
+    struct.pack_into("<I", data, end - 4 - 4 * 12 + 8, end - 30)  # the offset of the second page
+    (tmp_path / "p.tif").write_bytes(data)
+    frames = open_frames("p.tif", tmp_path)
+    np.testing.assert_array_equal(frames[0], stack[0])
+    with refused("p.tif frame 1"):
+        frames[1]
+
+
+@pytest.mark.skipif(not PACKED.is_file(), reason="shared/data is missing")
+def test_packed_tiff_of_a_camera():
+    frames = open_frames(PACKED)
+    assert (frames.bits, frames.shape, frames[0].min(), frames[0].max()) == (10, (1024, 1024), 1, 1023)
 
 
 def test_bits_of_metadata(tmp_path, stack12):
@@ -114,6 +148,17 @@ def test_bits_of_metadata(tmp_path, stack12):
     frames = open_frames(tmp_path / "a.png")
     same(frames, stack12[:1])
     assert frames.bits == 12
+
+
+@pytest.mark.parametrize(("codes", "cfa"), [(bytes([0, 1, 1, 2]), "RGGB"), (bytes([1, 2, 0, 1]), "GBRG")])
+def test_bayer_pattern_of_tiff(tmp_path, stack12, codes, cfa):
+    tags = [(33421, "H", 2, (2, 2), True), (33422, "B", 4, codes, True)]
+    write_tiff(tmp_path / "a.tif", stack12[0], photometric="cfa", extratags=tags)
+    write_tiff(tmp_path / "grey.tif", stack12[0], extratags=tags)
+    frames = open_frames(tmp_path / "a.tif")
+    np.testing.assert_array_equal(frames.load(0), stack12[0])
+    assert [frames.cfa, open_frames(f"{tmp_path}/a.tif[:]").cfa] == [cfa, cfa]
+    assert open_frames(tmp_path / "grey.tif").cfa is None
 
 
 @pytest.mark.parametrize("suffix", [".png", ".bmp"])
@@ -231,6 +276,67 @@ def test_photron_needs_both_files(tmp_path):
     (tmp_path / "rec.cih").write_text("nothing of use\n")
     with refused("rec.cih"):
         open_frames("rec.cih", tmp_path)
+
+
+# --- PCO
+
+
+@pytest.mark.parametrize("extended", [False, True])
+def test_b16_of_pco(tmp_path, stack12, extended):
+    for i, image in enumerate(stack12):
+        write_b16(tmp_path / f"a{i}.b16", image, b"a comment" * i, extended)
+    same(open_frames(tmp_path), stack12)
+    data = (tmp_path / "a1.b16").read_bytes()
+    (tmp_path / "a1.b16").write_bytes(data[:-1])
+    (tmp_path / "a2.b16").write_bytes(b"BM" + data[2:])
+    (tmp_path / "a3.b16").write_bytes(b"")
+    good, errors = good_frames(open_frames(".", tmp_path))
+    assert (good, list(errors)) == ([0], ["a1.b16", "a2.b16", "a3.b16"])
+
+
+@pytest.mark.parametrize("shift", [0, 2, 4])
+def test_time_stamps_of_pco_are_noted(tmp_path, rng, shift):
+    image = stamped(rng.integers(0, 65536, (H, 20)).astype(np.uint16), shift)
+    write_b16(tmp_path / "a.b16", image)
+    write_tiff(tmp_path / "b.tif", np.stack([image] * 2), photometric="minisblack")
+    for name in ("a.b16", "b.tif"):
+        (note,) = open_frames(name, tmp_path).notes
+        assert note.startswith(f"{name}: ")
+        assert "2024-05-03 12:34:56" in note
+        np.testing.assert_array_equal(open_frames(name, tmp_path)[0], image)
+
+
+@pytest.mark.parametrize("value", [0, 5, 0x11])
+def test_grey_values_are_no_time_stamps(tmp_path, rng, value):
+    for i, image in enumerate((np.full((H, 20), value, np.uint16), stamped(np.zeros((H, 20), np.uint16))[:, :12])):
+        write_tiff(tmp_path / f"{i}.tif", image)
+        assert open_frames(tmp_path / f"{i}.tif").notes == ()
+
+
+# --- photo cameras
+
+
+@pytest.mark.parametrize(("codes", "cfa"), [(bytes([0, 1, 1, 2]), "RGGB"), (bytes([1, 0, 2, 1]), "GRBG")])
+def test_raw_images_of_photo_cameras(tmp_path, rng, codes, cfa):
+    stack = rng.integers(60, 4001, (2, 60, 80)).astype(np.uint16)
+    stack[:, 3, 5] = 4000
+    for i, image in enumerate(stack):
+        write_dng(tmp_path / f"IMG_{i}.dng", image, codes, 64, 4000)
+    frames = open_frames(".", tmp_path)
+    for i, image in enumerate(stack):
+        np.testing.assert_array_equal(frames.load(i), np.maximum(image, 64) - 64)  # less the black level
+    assert (len(frames), frames.cfa, frames.bits, frames.white, frames.name(1)) == (2, cfa, 12, 3936, "IMG_1.dng")
+    assert frames.notes == ()
+    (tmp_path / "IMG_2.dng").write_bytes((tmp_path / "IMG_1.dng").read_bytes()[:3000])
+    with refused("IMG_2.dng"):
+        open_frames("IMG_2.dng", tmp_path)[0]
+
+
+def test_raw_images_without_their_package(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "rawpy", None)
+    (tmp_path / "a.NEF").touch()
+    with pytest.raises(InputError, match=r"pip install 'nerif-bost\[raw\]', or export"):
+        open_frames(tmp_path / "a.NEF")
 
 
 # --- LaVision
@@ -457,8 +563,14 @@ def test_reference_and_flow_have_one_size_and_depth(tmp_path, stack12, stack8):
         ("zzz", "zzz", "folder$"),
         ("nowhere/at/all.tif", "nowhere/at/all.tif", "no such"),
         ("empty", "empty", "is it the right folder"),
-        ("arrays", "arrays", "name the file, such as 'arrays/a.npy'"),
-        ("notes.txt", "notes.txt", "'.txt'"),
+        ("arrays", "arrays", "got 2 files ending in .npy; name one file, such as 'arrays/a.npy'"),
+        (
+            "films",
+            "films",
+            "got 3 files ending in .wmv, 1 file without ending, 1 folder; .* export other formats as TIFF",
+        ),
+        ("films/*.wmv", "films/*.wmv", "got 2 files ending in .wmv; .* TIFF"),
+        ("notes.txt", "notes.txt", "'.txt'; export other formats as TIFF"),
         ("arrays/*.npy", "arrays/a.npy", "one recording"),
     ],
 )
@@ -466,6 +578,9 @@ def test_missing_files(tmp_path, stack8, spec, field, remedy):
     write_images(tmp_path / "cam1", stack8)
     for name in ("empty", "arrays"):
         (tmp_path / name).mkdir()
+    (tmp_path / "films" / "old").mkdir(parents=True)
+    for name in ("1.wmv", "2.WMV", "3.wmv", "readme", ".hidden"):
+        (tmp_path / "films" / name).touch()
     for name in "ab":
         np.save(tmp_path / "arrays" / f"{name}.npy", stack8)
     (tmp_path / "notes.txt").touch()

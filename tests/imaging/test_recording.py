@@ -12,6 +12,7 @@ import tifffile
 import torch
 from scipy.ndimage import gaussian_filter, map_coordinates
 
+from imaging_files import write_cine
 from nerif.common.conventions import InputError
 from nerif.geometry import Box, Lens, Plane, Ring
 from nerif.imaging import workers
@@ -70,6 +71,21 @@ def test_views_that_cannot_be_used_are_left_out(recording, lines):
     del cameras["0deg"]
     with refused("calibration"):
         replace(recording, cameras=cameras)
+
+
+def test_a_film_gives_the_measurement_of_its_images(recording, tmp_path, lines):
+    view = recording.views[0]
+    folder = tmp_path / view.name
+    images = np.concatenate([tifffile.imread(folder / f"{source}.tif") for source in ("reference", "flow")])
+    write_cine(folder / "run.cine", [image[::-1].tobytes() for image in images], *SHAPE, flip=1)
+    sources = {"reference": f"{view.name}/run.cine[:3]", "flow": f"{view.name}/run.cine[3:]"}
+    film = ViewReference.of(recording, replace(view, sources=sources), say=lines.append)
+    (note,) = lines  # once, though two sources have it
+    assert note.startswith(f"note: {view.name}/run.cine: shown flipped")
+    stack = ViewReference.of(recording, view)
+    (_, ours, _), (_, theirs, _) = film.measure([1]), stack.measure([1])
+    np.testing.assert_array_equal(ours.displacement, theirs.displacement)
+    np.testing.assert_array_equal(ours.valid, theirs.valid)
 
 
 def test_a_sequence_of_one_frame_equals_the_measurement(recording, tmp_path):

@@ -13,6 +13,7 @@ from nerif.imaging.calibration.target_images import find_targets, pose_names
 from nerif.imaging.calibration.targets import CalibrationTarget
 from nerif.imaging.image_quality import image_quality, jpeg_address, shrink
 from nerif.imaging.readers.crop import Crop
+from nerif.imaging.readers.image_files import Tiff
 from nerif.imaging.readers.open import open_frames
 from nerif.imaging.readers.views import BEFORE, find_views, good_images, write_crops
 from refusals import refused
@@ -133,6 +134,15 @@ def test_over_exposed_images_are_reported(folder, lines):
     for line in (quality.notes[0], lines[0]):
         assert "flow.tif" in line
         assert "over-exposed" in line
+
+
+def test_notes_about_files_are_reported_once_per_source(folder, lines, monkeypatch):
+    monkeypatch.setattr(Tiff, "notes", ("a time stamp in its first pixels",))
+    view = find_views(folder)[0]
+    good_images(view, "reference", lines.append)
+    assert lines == ["note: cam2/reference/r0.tif: a time stamp in its first pixels"]
+    assert lines == [f"note: {note}" for note in image_quality(view, "reference").notes]
+    assert len(open_frames(f"{folder}/cam2/reference[1:]").notes) == 1
 
 
 def test_samples_of_many_images_are_evenly_spread(folder, lines):

@@ -179,6 +179,9 @@ class ViewReference:
         """
         view.check_alike()
         images = good_images(view, "reference", say, recording.references)
+        for note in view.open("flow").notes:
+            if note not in view.open("reference").notes:
+                say(f"note: {note}")
         shape = (images[0].shape[0], images[0].shape[1])
         camera = camera_of(view, recording.cameras[view.name], shape)
         reference = Reference.of(images, recording.method, view.full_scale, averages)

@@ -33,6 +33,8 @@ def find_targets(
             continue
         frames = view.open(source)
         names = pose_names(frames)
+        for note in frames.notes:
+            say(f"note: {note}")
         for i, image in read_each(frames, range(len(frames))):
             if isinstance(image, InputError):
                 say(f"left out: {image}")

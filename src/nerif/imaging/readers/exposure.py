@@ -32,11 +32,14 @@ def effective_bits(*sources: Frames) -> int:
 
 
 def full_scale(*sources: Frames) -> float:
-    """Return the grey value of a saturated pixel.
+    """Return the grey value of a saturated pixel: that of the metadata, unless the sampled frames exceed it.
 
-    With b effective bits, of which the lowest k are zero in all sampled frames (values shifted to the upper end of
-    their container, or a digital gain), it is 2^b - 2^k; for floats from 0 to 1 it is 1.
+    Else, with b effective bits, of which the lowest k are zero in all sampled frames (values shifted to the upper end
+    of their container, or a digital gain), it is 2^b - 2^k; for floats from 0 to 1 it is 1.
     """
+    whites = [s.white for s in sources if s.white is not None]
+    if len(whites) == len(sources) and max(s.layout.peak for s in sources) <= max(whites):
+        return float(max(whites))
     bits = effective_bits(*sources)
     used = int(np.bitwise_or.reduce([s.layout.used for s in sources]))
     unused = min((used & -used).bit_length() - 1, bits - MIN_BITS) if used else 0

@@ -48,6 +48,13 @@ class Frames(ABC):
     """Recording time of each frame, s; None if the file has none."""
     metadata_bits: int | None = None
     """Effective bits in the metadata of the file."""
+    white: int | None = None
+    """Grey value of a saturated pixel in the metadata, if not the largest of the effective bits."""
+    cfa: str | None = None
+    """Bayer pattern of raw values in the metadata, such as RGGB: the colours of the first two pixels of the first two
+    rows; None if unknown or none."""
+    notes: tuple[str, ...] = ()
+    """Warnings about the file, each a line that begins with its name."""
 
     @abstractmethod
     def __len__(self) -> int: ...
@@ -135,6 +142,7 @@ class SelectedFrames(Frames):
 
     def __init__(self, frames: Frames, indices: Sequence[int]) -> None:
         self._frames, self._indices, self.metadata_bits = frames, indices, frames.metadata_bits
+        self.white, self.cfa = frames.white, frames.cfa
         if frames.times is not None:
             self.times = frames.times[list(indices)]
 
@@ -146,6 +154,10 @@ class SelectedFrames(Frames):
 
     def load(self, i: int) -> np.ndarray:
         return self._frames.load(self._indices[i])
+
+    @property
+    def notes(self) -> tuple[str, ...]:  # type: ignore[override]
+        return self._frames.notes
 
 
 def as_float(values: np.ndarray) -> np.ndarray:

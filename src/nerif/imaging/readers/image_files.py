@@ -1,4 +1,4 @@
-"""Frames in image files, one or more in each: TIFF, PNG, BMP, JPEG, LaVision."""
+"""Frames in image files, one or more in each: TIFF, PNG, BMP, JPEG, LaVision, and those of other modules."""
 
 from __future__ import annotations
 
@@ -6,20 +6,25 @@ import logging
 import re
 import weakref
 import zlib
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 
 from nerif.common.conventions import InputError
 from nerif.common.installation import install
+from nerif.imaging.readers.camera_raw import RAW_SUFFIXES, CameraRaw
 from nerif.imaging.readers.frames import Frames, check_size
+from nerif.imaging.readers.image_file import ImageFile
+from nerif.imaging.readers.packed import unpack
+from nerif.imaging.readers.pco import B16, note_of_time_stamp
 
-__all__ = ["FileFrames"]
+__all__ = ["OPENERS", "FileFrames"]
+
+Value = TypeVar("Value")
 
 
 class FileFrames(Frames):
@@ -30,11 +35,10 @@ class FileFrames(Frames):
         self._last: tuple[int, ImageFile] | None = None
         counts: list[int] = []
         for k, path in enumerate(files):
-            lavision = _opener(path) is LaVision
-            if lavision:
-                _lvpyio()
+            opener = _opener(path)
+            opener.check_package()
             # to count the images of a LaVision file is to read it: all are taken to have as many as the first
-            counts.append(counts[0] if lavision and counts else self._count(k))
+            counts.append(counts[0] if opener is LaVision and counts else self._count(k))
         self._counts = counts
         self._places = [(k, i) for k, count in enumerate(counts) for i in range(count)]
 
@@ -68,31 +72,30 @@ class FileFrames(Frames):
         except InputError as error:
             raise error.inside(self.name(i)) from None
 
-    @cached_property
-    def metadata_bits(self) -> int | None:  # type: ignore[override]
-        for k in range(len(self._files)):
+    def _metadata(self, read: Callable[[ImageFile, str], Value], default: Value) -> Value:
+        """Metadata of the first readable file."""
+        for k, name in enumerate(self._names):
             try:
-                return self._open(k).bits
+                return read(self._open(k), name)
             except Exception:  # reported when the frame is read
                 continue
-        return None
+        return default
 
+    @cached_property
+    def metadata_bits(self) -> int | None:  # type: ignore[override]
+        return self._metadata(lambda file, _: file.bits, None)
 
-class ImageFile(ABC):
-    """An open file of images."""
+    @cached_property
+    def white(self) -> int | None:  # type: ignore[override]
+        return self._metadata(lambda file, _: file.white, None)
 
-    bits: int | None = None
-    """Effective bits in the metadata."""
+    @cached_property
+    def cfa(self) -> str | None:  # type: ignore[override]
+        return self._metadata(lambda file, _: file.cfa, None)
 
-    @abstractmethod
-    def __init__(self, path: Path) -> None: ...
-
-    def __len__(self) -> int:
-        return 1
-
-    @abstractmethod
-    def read(self, i: int) -> np.ndarray:
-        """Return image `i` as stored; channels, if any, as R, G, B."""
+    @cached_property
+    def notes(self) -> tuple[str, ...]:  # type: ignore[override]
+        return self._metadata(lambda file, name: tuple(f"{name}: {note}" for note in file.notes), ())
 
 
 class Tiff(ImageFile):
@@ -139,7 +142,7 @@ class Tiff(ImageFile):
                 raise _too_few_bits(page.bitspersample)
             check_size(page.shape)
             try:
-                image = page.asarray()
+                image = self._read_packed(page) if _is_packed(page) else page.asarray()
             except (ValueError, NotImplementedError) as error:
                 if "imagecodecs" not in str(error):
                     raise
@@ -160,8 +163,22 @@ class Tiff(ImageFile):
         image = image.reshape(page.shape)
         return _inverted(image, page.bitspersample) if page.photometric == MIN_IS_WHITE else image
 
+    def _read_packed(self, page: Any) -> np.ndarray:
+        """A page of 9 to 15 bit; each row begins with a new byte."""
+        (height, width), bits = page.shape, page.bitspersample
+        row = -(-width * bits // 8)
+        strips: Any = self._tiff.filehandle.read_segments(page.dataoffsets, page.databytecounts)
+        data = np.frombuffer(b"".join(strip or b"" for strip, _ in strips), np.uint8)
+        if len(data) < height * row:
+            raise ValueError(f"{len(data)} bytes of {height * row}")
+        if page.fillorder == LOWEST_BIT_FIRST:
+            data = np.packbits(np.unpackbits(data, bitorder="little"))
+        padded = np.zeros((height, row + -row % bits), np.uint8)  # rows of whole values
+        padded[:, :row] = data[: height * row].reshape(height, row)
+        return unpack(padded.ravel(), bits, padded.size * 8 // bits).reshape(height, -1)[:, :width]
+
     def _read_by_opencv(self, i: int, page: Any) -> np.ndarray:
-        """Compressed and packed pages that tifffile cannot decode; OpenCV shifts packed bits to the top and turns."""
+        """Compressed pages that tifffile cannot decode; OpenCV shifts packed bits to the top and turns."""
         import cv2
 
         _, images = cv2.imreadmulti(str(self._path), start=i, count=1, flags=cv2.IMREAD_UNCHANGED)
@@ -172,6 +189,18 @@ class Tiff(ImageFile):
             image = TURNED[orientation](image)
         image = np.right_shift(image, 16 - bits) if 8 < bits < 16 else image
         return _inverted(image, bits) if page.photometric == MIN_IS_WHITE else _as_rgb(image)
+
+    @property
+    def notes(self) -> tuple[str, ...]:  # type: ignore[override]
+        page: Any = self._tiff.pages[0]
+        return note_of_time_stamp(self.read(0)) if page.bitspersample == 16 and page.samplesperpixel == 1 else ()
+
+    @property
+    def cfa(self) -> str | None:  # type: ignore[override]
+        page: Any = self._tiff.pages[0]
+        size, codes = (page.tags.valueof(name, ()) for name in ("CFARepeatPatternDim", "CFAPattern"))
+        plain = page.photometric == CFA and tuple(size) == (2, 2) and len(codes) == 4 and max(codes) < len("RGB")
+        return "".join("RGB"[code] for code in codes) if plain else None
 
     @property
     def bits(self) -> int | None:  # type: ignore[override]
@@ -272,6 +301,10 @@ class LaVision(ImageFile):
                 raise InputError("expected images, got vectors; give the .im7 files they were computed from")
             self._planes += list(frame.components["PIXEL"].planes)
 
+    @staticmethod
+    def check_package() -> None:
+        _lvpyio()
+
     def __len__(self) -> int:
         return len(self._planes)
 
@@ -292,7 +325,8 @@ def _lvpyio() -> Any:
     return lvpyio
 
 
-MIN_IS_WHITE, PALETTE = 0, 3  # photometric interpretations of TIFF
+NO_COMPRESSION, LOWEST_BIT_FIRST = 1, 2  # compression and fill order of TIFF
+MIN_IS_WHITE, PALETTE, CFA = 0, 3, 32803  # photometric interpretations of TIFF
 PNG_PALETTE = 3  # colour type
 REDUCED = 1  # bit of NewSubfileType: a thumbnail
 
@@ -305,6 +339,12 @@ TURNED: dict[int, Callable[[np.ndarray], np.ndarray]] = {
 
 def _is_reduced(page: Any) -> bool:
     return bool(int(page.tags.valueof("NewSubfileType", 0) or 0) & REDUCED) if hasattr(page, "tags") else False
+
+
+def _is_packed(page: Any) -> bool:
+    """Whether grey values of 9 to 15 bit follow one another, in strips."""
+    plain = page.compression == NO_COMPRESSION and page.samplesperpixel == 1 and not page.is_tiled
+    return plain and 8 < page.bitspersample < 16
 
 
 def _images_of_imagej(tiff: Any) -> int:
@@ -323,7 +363,7 @@ def _inverted(image: np.ndarray, bits: int) -> np.ndarray:
 
 OPENERS: dict[str, type[ImageFile]] = {
     ".tif": Tiff, ".tiff": Tiff, ".png": Png, ".bmp": Image, ".jpg": Image, ".jpeg": Image,
-    ".im7": LaVision, ".vc7": LaVision,
+    ".im7": LaVision, ".vc7": LaVision, ".b16": B16, **dict.fromkeys(RAW_SUFFIXES, CameraRaw),
 }  # fmt: skip
 
 

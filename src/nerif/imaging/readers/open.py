@@ -9,6 +9,8 @@ import difflib
 import glob
 import os
 import re
+from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -16,15 +18,26 @@ from jaxtyping import Bool
 
 from nerif.common.conventions import InputError
 from nerif.imaging.readers.array_files import ArrayFrames, Hdf5Frames
+from nerif.imaging.readers.cine import CineFrames
 from nerif.imaging.readers.frames import Frames, SelectedFrames, size_in_words
-from nerif.imaging.readers.image_files import FileFrames
+from nerif.imaging.readers.image_files import OPENERS, FileFrames
 from nerif.imaging.readers.photron import PhotronFrames
+from nerif.imaging.readers.video import VideoFrames
 
 __all__ = ["FOLDER_SUFFIXES", "open_frames", "read_mask"]
 
-FOLDER_SUFFIXES = (".tif", ".tiff", ".png", ".bmp", ".jpg", ".jpeg", ".im7")
-SINGLE_SUFFIXES = (".cih", ".cihx", ".mraw", ".npy", ".npz", ".h5", ".hdf5", ".hdf")
+FOLDER_SUFFIXES = tuple(suffix for suffix in OPENERS if suffix != ".vc7")
+FILMS: dict[str, Callable[[Path, str], Frames]] = {
+    **dict.fromkeys((".cih", ".cihx", ".mraw"), PhotronFrames), ".cine": CineFrames,
+    **dict.fromkeys((".avi", ".mp4", ".m4v", ".mov", ".mkv"), VideoFrames),
+}  # fmt: skip
+ARRAYS: dict[str, Callable[[Path, str, str], Frames]] = {
+    **dict.fromkeys((".npy", ".npz"), ArrayFrames), **dict.fromkeys((".h5", ".hdf5", ".hdf"), Hdf5Frames)
+}  # fmt: skip
+SINGLE_SUFFIXES = (*FILMS, *ARRAYS)
 SUFFIXES = (*FOLDER_SUFFIXES, ".vc7", *SINGLE_SUFFIXES)
+READ = " ".join(SUFFIXES)
+EXPORT = "export other formats as TIFF"
 SELECTION = re.compile(r"(.+)\[(-?\d+|-?\d*:-?\d*(?::-?\d*)?)\]")
 DATASET = re.compile(r"(.+\.(?:h5|hdf5|hdf|npz)):(.+)", re.IGNORECASE)
 
@@ -73,16 +86,14 @@ def read_mask(path: Path, shape: tuple[int, int]) -> Bool[np.ndarray, "row colum
 def _open_files(files: list[Path], names: list[str], dataset: str = "") -> Frames:
     for path, name in zip(files, names, strict=True):
         if path.suffix.lower() not in SUFFIXES:
-            raise InputError(f"expected one of {' '.join(SUFFIXES)}, got '{path.suffix}'", field=name)
+            raise InputError(f"expected one of {READ}, got '{path.suffix}'; {EXPORT}", field=name)
         if len(files) > 1 and path.suffix.lower() in SINGLE_SUFFIXES:
             raise InputError(f"one of {len(files)} files of a pattern; name one recording at a time", field=name)
-    match files[0].suffix.lower():
-        case ".cih" | ".cihx" | ".mraw":
-            return PhotronFrames(files[0], names[0])
-        case ".h5" | ".hdf5" | ".hdf":
-            return Hdf5Frames(files[0], names[0], dataset)
-        case ".npy" | ".npz":
-            return ArrayFrames(files[0], names[0], dataset)
+    suffix = files[0].suffix.lower()
+    if suffix in FILMS:
+        return FILMS[suffix](files[0], names[0])
+    if suffix in ARRAYS:
+        return ARRAYS[suffix](files[0], names[0], dataset)
     return FileFrames(files, names)
 
 
@@ -107,20 +118,33 @@ def _find_files(path: Path, base: Path | None) -> list[Path]:
     if path.is_dir():
         files = [p for p in path.iterdir() if p.suffix.lower() in FOLDER_SUFFIXES and not p.name.startswith(".")]
         if not files:
-            others = sorted(p.name for p in path.iterdir() if p.suffix.lower() in SUFFIXES)
-            remedy = f"name the file, such as '{label}/{others[0]}'" if others else "is it the right folder?"
-            raise InputError(f"expected images ({' '.join(FOLDER_SUFFIXES)}), got none; {remedy}", field=label)
+            inside = [p for p in path.iterdir() if not p.name.startswith(".")]
+            raise InputError(f"expected images, got {_content(inside, base)}", field=label)
     elif path.is_file():
         return [path]
     elif re.search(r"[*?]", str(path)):
-        matches = (Path(p) for p in glob.glob(str(path).replace("[", "[[]"), recursive=True))
-        files = [p for p in matches if p.suffix.lower() in SUFFIXES and p.is_file()]
+        names = glob.glob(str(path).replace("[", "[[]"), recursive=True)
+        matches = [p for p in map(Path, names) if p.is_file()]
+        files = [p for p in matches if p.suffix.lower() in SUFFIXES]
         if not files:
-            raise InputError(f"expected files of this pattern, got none{_nearest(path, base)}", field=label)
+            content = _content(matches, base) if matches else f"none{_nearest(path, base)}"
+            raise InputError(f"expected files of this pattern, got {content}", field=label)
     else:
         raise InputError(f"no such file or folder{_nearest(path, base)}", field=label)
     _check_twins(files, label)
     return sorted(files, key=_natural)
+
+
+def _content(paths: list[Path], base: Path | None) -> str:
+    """Describe paths among which are no images, with a remedy."""
+    endings = Counter(f"ending in {p.suffix.lower()}" if p.suffix else "without ending" for p in paths if p.is_file())
+    content = [f"{n} file{'s' * (n > 1)} {ending}" for ending, n in endings.most_common(4)]
+    if folders := sum(p.is_dir() for p in paths):
+        content.append(f"{folders} folder{'s' * (folders > 1)}")
+    text = f"{', '.join(content) or 'none'}; "
+    if single := sorted(p for p in paths if p.suffix.lower() in SUFFIXES):
+        return text + f"name one file, such as '{_label(single[0], base)}'"
+    return text + "is it the right folder?" + (f" Images end in {READ}; {EXPORT}" if endings else "")
 
 
 def _check_twins(files: list[Path], label: str) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 
 from nerif.common.conventions import InputError
 from nerif.imaging.readers.frames import Frames, check_size
+from nerif.imaging.readers.packed import unpack
 
 __all__ = ["PhotronFrames"]
 
@@ -61,7 +62,7 @@ class PhotronFrames(Frames):
             first, last = i * pixels // 2, -(-(i + 1) * pixels // 2)
             data = self._bytes(i, 3 * first, 3 * last - ((i + 1) * pixels) % 2)
             skip = i * pixels % 2
-            values = unpack12(np.concatenate([data, np.zeros(-len(data) % 3, np.uint8)]))[skip : skip + pixels]
+            values = unpack(data, 12, skip + pixels)[skip:]
         else:
             size = self._stored // 8
             values = self._bytes(i, i * pixels * size, (i + 1) * pixels * size).view("<u2" if size == 2 else "u1")
@@ -77,12 +78,6 @@ class PhotronFrames(Frames):
                 field=self.name(i),
             )
         return data
-
-
-def unpack12(data: np.ndarray) -> np.ndarray:
-    """Unpack pairs of 12-bit values, most significant bits first, from triples of bytes."""
-    one, two, three = data.reshape(-1, 3).astype(np.uint16).T
-    return np.stack([(one << 4) | (two >> 4), ((two & 15) << 8) | three], axis=-1).ravel()
 
 
 def _partner(path: Path, name: str, suffixes: tuple[str, ...]) -> Path:

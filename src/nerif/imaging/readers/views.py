@@ -226,6 +226,8 @@ def read_sample(view: View, source: str, most: int = 0) -> Iterator[tuple[int, s
 def good_images(view: View, source: str, say: Callable[[str], None], most: int = 0) -> Images:
     """Return the usable images out of `most` evenly spread ones of a source (0: all); report what is wrong."""
     frames, numbers, errors = view.open(source), [], []
+    for note in frames.notes:
+        say(f"note: {note}")
     for i, name, image in read_sample(view, source, most):
         if isinstance(image, InputError):
             errors.append(image)
