@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from nerif.geometry import PROJECTIONS, Box, Camera, Plane, projection_named
-from nerif.geometry.camera import distort, fold, undistort
+from nerif.geometry.distortion import distort, fold, undistort
 from refusals import refused
 
 F64 = torch.float64

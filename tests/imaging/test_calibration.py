@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from calibration_images import detection, target_images
 from nerif.geometry import PROJECTIONS, TELECENTRIC, Camera, Plane, Ring
-from nerif.imaging.calibration.bundle import Bundle, Observation, Pose, _Layout, adjust
+from nerif.imaging.calibration.bundle import INTRINSIC, TILT, Bundle, Observation, Pose, _Layout, adjust
 from nerif.imaging.calibration.calibrate import CalibrationSettings, _on_side, calibrate
 from nerif.imaging.calibration.cameras_file import read_cameras
 from nerif.imaging.calibration.first_guess import first_guess, mirror
@@ -324,7 +324,7 @@ def small(kind: str) -> tuple[Bundle, list[Observation]]:
         common = sorted(set(views[0].poses) & set(views[1].poses))[:3]
         views = [replace(v, poses={n: v.poses[n] for n in common}) for v in views]
         bundle, observations = first_guess(views, ("k1", "k2", "p1", "p2", "k3"), common[0], TELECENTRIC)
-        bundle.intrinsics[:, 4:] = (1e-6, 1e-10, 1e-6, 2e-6, 1e-14)
+        bundle.intrinsics[:, 4:9] = (1e-6, 1e-10, 1e-6, 2e-6, 1e-14)
         return bundle, observations
     pair = CAMERAS[1:3]
     poses = target_poses(pair, TARGET, 4, seed=3)
@@ -333,9 +333,9 @@ def small(kind: str) -> tuple[Bundle, list[Observation]]:
         for i, camera in enumerate(pair)
         for j, pose in enumerate(poses)
     ]
-    k = np.array([[c.intrinsics[0, 0], c.intrinsics[1, 1], 250, 200, 0, 0, 0, 0, 0] for c in pair], dtype=float)
+    k = np.array([[c.intrinsics[0, 0], c.intrinsics[1, 1], 250, 200, *np.zeros(7)] for c in pair], dtype=float)
     cameras = tuple(Pose(c.rotation.numpy(), c.translation.numpy() + 1.0) for c in pair)
-    return Bundle(k, cameras, tuple(poses), 0, (True,) * 8 + (False,), ((400, 500),) * 2), observations
+    return Bundle(k, cameras, tuple(poses), 0, (True,) * 8 + (False,) * 3, ((400, 500),) * 2), observations
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -365,7 +365,7 @@ def test_adjustment_ends_in_a_minimum():
     rng = np.random.default_rng(0)
     spread = np.where(np.abs(x) > 0, np.abs(x), 1.0)
     assert all(layout.cost(x + 1e-4 * spread * rng.standard_normal(len(x))) > minimum for _ in range(20))
-    assert np.all(np.diagonal(covariance, axis1=1, axis2=2)[:, 9:] > 0)
+    assert np.all(np.diagonal(covariance, axis1=1, axis2=2)[:, INTRINSIC:] > 0)
 
 
 def test_poses_compose_and_invert():
