@@ -29,7 +29,7 @@ __all__ = [
     "projection_named",
 ]  # fmt: skip
 
-MAX_TILT = math.pi / 4
+MAX_TILT = 45.0  # degrees
 MAX_IMAGE_EDGE = 100_000  # px
 LATTICE = 33  # pixels along either edge that represent an image
 
@@ -219,8 +219,8 @@ class Camera:
         remedy = "; a transposed K (MATLAB) has to be transposed back"
         check("intrinsics", upper, "K = [[fx, s, cx], [0, fy, cy], [0, 0, 1]]", k.tolist(), remedy)
         remedy = "; give degrees times pi / 180"
-        valid = bool((self.tilt.abs() < MAX_TILT).all())
-        check("tilt", valid, "angles of the sensor below 45 degrees, in rad", self.tilt.tolist(), remedy)
+        valid = bool((torch.rad2deg(self.tilt).abs() < MAX_TILT).all())
+        check("tilt", valid, f"angles below {MAX_TILT:g} degrees, in rad", self.tilt.tolist(), remedy)
         remedy = "; remove it, since fx, fy and skew describe a tilted sensor where rays are parallel"
         valid = kind.shows_depth or not bool(self.tilt.any())
         check("tilt", valid, f"none for a {kind.name} camera", self.tilt.tolist(), remedy)

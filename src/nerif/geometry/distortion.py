@@ -72,7 +72,7 @@ def from_sensor(points: Pixels, coefficients: Float[Tensor, 5], angles: Float[Te
 def tilt(x: Array, y: Array, angles: Iterable[Any]) -> tuple[Array, Array, tuple[Array, Array, Array, Array]]:
     """Return x_t, y_t of (x_d, y_d), and their derivatives d x_t / d x_d, d x_t / d y_d, d y_t / d x_d, d y_t / d y_d.
 
-        x_t = x_d / (w cos b),     y_t = (y_d / cos a - x_d tan a tan b) / w,     w = 1 + x_d tan b / cos a - y_d tan a
+    x_t = x_d / (w cos b),     y_t = (y_d / cos a - x_d tan a tan b) / w,     w = 1 + x_d tan b / cos a - y_d tan a
     """
     a, b = map(float, angles)
     across, down, shear = math.tan(b) / math.cos(a), -math.tan(a), -math.tan(a) * math.tan(b)

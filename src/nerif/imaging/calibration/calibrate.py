@@ -63,7 +63,7 @@ class CalibrationSettings:
         check_settings(self)
         if self.scheimpflug and not self.kind.shows_depth:
             raise InputError(
-                f"expected perspective, got {self.projection}; leave it out: where rays are parallel, fx and fy describe "
+                f"expected perspective, got {self.projection}; leave it out, since fx and fy of parallel rays describe "
                 "a sensor tilted about its rows or columns",
                 field="scheimpflug",
             )

@@ -99,7 +99,8 @@ class CalibratedCamera:
         """
         coefficients, last = _coefficients(distortion, f"{where}: distortion")
         if tilt is not None and bool(last.any()):
-            raise InputError(f"expected it once, got {last.tolist()} in distortion too; remove one", field=f"{where}: tilt")
+            got = f"got {last.tolist()} in distortion too"
+            raise InputError(f"expected it once, {got}; remove one", field=f"{where}: tilt")
         return cls(
             name=name,
             intrinsics=_upright(numbers(intrinsics, (3, 3), f"{where}: intrinsics")),
@@ -176,7 +177,7 @@ def _coefficients(coefficients: Any, name: str) -> tuple[Tensor, Tensor]:
     whole = np.concatenate([vector, np.zeros(max(0, 14 - len(vector)))])
     if whole[5:12].any() or whole[14:].any():
         raise InputError(
-            "expected at most 5 distortion coefficients (k1 k2 p1 p2 k3) and, as the last of 14, the tilt (tau_x tau_y), "
+            "expected at most 5 distortion coefficients (k1 k2 p1 p2 k3) and, as the last of 14, the tilt tau_x tau_y, "
             f"got {len(vector)} with others that are not 0; calibrate again without the rational and thin-prism models",
             field=name,
         )
@@ -295,10 +296,7 @@ def _camera(table: dict[str, Any], index: int, path: str) -> CalibratedCamera:
 
 
 def _lens(table: dict[str, Any], where: str) -> Lens | None:
-    diameter, focus = (
-        float(numbers(table[key], (), f"{where}: {key}")) if key in table else None
-        for key in LENS
-    )
+    diameter, focus = (float(numbers(table[key], (), f"{where}: {key}")) if key in table else None for key in LENS)
     if diameter is None:
         if focus is not None:
             raise InputError("focus_distance: expected together with aperture_diameter, got it alone", field=where)
