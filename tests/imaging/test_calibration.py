@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
 from calibration_images import detection, target_images
+from nerif.common.files import read_toml
 from nerif.geometry import PROJECTIONS, TELECENTRIC, Camera, Plane, Ring
 from nerif.imaging.calibration.bundle import INTRINSIC, Bundle, Observation, Pose, _Layout, adjust
 from nerif.imaging.calibration.calibrate import CalibrationSettings, _on_side, calibrate
@@ -259,6 +261,7 @@ def test_a_wrong_number_of_squares_and_a_large_error_are_refused():
         ({"projection": "fisheye"}, "projection"),
         ({"projection": "telecentric", "side": None}, "side"),
         ({"projection": "telecentric", "side": (NAMES[0], "left")}, "side"),
+        ({"projection": "telecentric", "side": (NAMES[0], "x+"), "scheimpflug": True}, "scheimpflug"),
     ],
 )
 def test_invalid_settings(change, field, unchecked):
@@ -273,6 +276,48 @@ def test_names_of_views_and_poses_that_are_none():
         calibrate(images(poses=4), replace(SETTINGS["perspective"], world="77"))
     with refused("side"):
         calibrate(images("telecentric"), replace(SETTINGS["telecentric"], side=("cam9", "x+")))
+
+
+# -- Scheimpflug ---------------------------------------------------------------------------------------------------
+
+TILTS = np.array([[6.0, -8.0], [-9.0, 2.5]])  # degrees
+SCHEIMPFLUG = replace(SETTINGS["perspective"], scheimpflug=True, axes=world_axes(CAMERAS[1:3]))
+
+
+def tilted_pair(tilts: np.ndarray) -> tuple[Camera, ...]:
+    pairs = zip(CAMERAS[1:3], np.radians(tilts), strict=True)
+    return tuple(replace(camera, tilt=torch.from_numpy(tilt)) for camera, tilt in pairs)
+
+
+@pytest.mark.parametrize("tilts", [TILTS, 0 * TILTS])
+def test_tilts_come_back_within_their_standard_deviations_also_of_0(tmp_path, tilts):
+    cameras = tilted_pair(tilts)
+    result = calibrate(target_images(cameras, TARGET, NOISE, 14), SCHEIMPFLUG)
+    assert result.rms() == pytest.approx(NOISE * np.sqrt(2), rel=0.05)
+    errors = (result.tilt - tilts) / result.sigma_tilt
+    assert np.abs(errors).max() < 3.5
+    assert 0.1 < result.sigma_tilt.min() < result.sigma_tilt.max() < 1.0
+    points = torch.from_numpy(np.random.default_rng(0).uniform(-20, 20, (50, 3)))
+    for camera, calibrated in zip(cameras, result.cameras, strict=True):
+        whole = calibrated.camera(background=camera.background)
+        assert float((whole.project(points) - camera.project(points)).abs().max()) < NOISE
+    result.write(tmp_path / "c.toml")
+    cameras, about = read_cameras(tmp_path / "c.toml"), read_toml(tmp_path / "c.toml")["about"]
+    assert np.allclose(np.degrees(np.stack([c.tilt.numpy() for c in cameras])), result.tilt, atol=1e-12)
+    assert list(about["sigma_tilt_deg"].values()) == result.sigma_tilt.tolist()
+
+
+def test_the_reprojection_error_is_that_of_opencv():
+    """One camera of the same parameters; where images hardly tell tilt and principal point apart, they may differ."""
+    (view,) = target_images(tilted_pair(TILTS)[:1], TARGET, NOISE, 14)
+    result = calibrate([view], SCHEIMPFLUG)
+    images = [*view.poses.values(), *view.background.values()]
+    points, pixels = ([getattr(d, name).astype(np.float32) for d in images] for name in ("points", "pixels"))
+    k = np.array([[1700.0, 0, 249.5], [0, 1700.0, 199.5], [0, 0, 1]])
+    flags = cv2.CALIB_TILTED_MODEL | cv2.CALIB_FIX_K3 | cv2.CALIB_USE_INTRINSIC_GUESS
+    flags |= sum(getattr(cv2, f"CALIB_FIX_{name}") for name in ("K4", "K5", "K6"))
+    rms, *_ = cv2.calibrateCamera(points, pixels, (500, 400), k, np.zeros(14), flags=flags)
+    assert result.rms() == pytest.approx(rms, rel=2e-3)
 
 
 # -- telecentric: two rotations per image, and the mirror image of the rig -----------------------------------------
@@ -335,10 +380,13 @@ def small(kind: str) -> tuple[Bundle, list[Observation]]:
     ]
     k = np.array([[c.intrinsics[0, 0], c.intrinsics[1, 1], 250, 200, *np.zeros(7)] for c in pair], dtype=float)
     cameras = tuple(Pose(c.rotation.numpy(), c.translation.numpy() + 1.0) for c in pair)
-    return Bundle(k, cameras, tuple(poses), 0, (True,) * 8 + (False,) * 3, ((400, 500),) * 2), observations
+    tilted = kind == "scheimpflug"
+    k[:, 9:] = [(0.1, -0.07), (-0.05, 0.2)] if tilted else 0
+    free = (*(True,) * 8, False, *(tilted,) * 2)
+    return Bundle(k, cameras, tuple(poses), 0, free, ((400, 500),) * 2), observations
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", [*KINDS, "scheimpflug"])
 def test_normal_equations_are_the_slope_of_the_cost(kind):
     bundle, observations = small(kind)
     layout = _Layout(bundle, observations, noise=10.0)  # in the quadratic part of Huber's loss
