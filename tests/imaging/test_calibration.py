@@ -289,10 +289,10 @@ def tilted_pair(tilts: np.ndarray) -> tuple[Camera, ...]:
     return tuple(replace(camera, tilt=torch.from_numpy(tilt)) for camera, tilt in pairs)
 
 
-@pytest.mark.parametrize("tilts", [TILTS, 0 * TILTS])
+@pytest.mark.parametrize("tilts", [TILTS, pytest.param(0 * TILTS, marks=pytest.mark.slow)])
 def test_tilts_come_back_within_their_standard_deviations_also_of_0(tmp_path, tilts):
     cameras = tilted_pair(tilts)
-    result = calibrate(target_images(cameras, TARGET, NOISE, 14), SCHEIMPFLUG)
+    result = calibrate(target_images(cameras, TARGET, NOISE, 10), SCHEIMPFLUG)
     assert result.rms() == pytest.approx(NOISE * np.sqrt(2), rel=0.05)
     errors = (result.tilt - tilts) / result.sigma_tilt
     assert np.abs(errors).max() < 3.5
@@ -307,6 +307,16 @@ def test_tilts_come_back_within_their_standard_deviations_also_of_0(tmp_path, ti
     assert list(about["sigma_tilt_deg"].values()) == result.sigma_tilt.tolist()
 
 
+@pytest.mark.slow
+def test_pose_sigma_is_for_the_tilt_as_it_is():
+    """The prior of a refinement, which keeps the tilt: about that of a calibration without it."""
+    views = target_images(tilted_pair(TILTS), TARGET, NOISE, 10)
+    one, other = (calibrate(views, replace(SCHEIMPFLUG, scheimpflug=s)) for s in (True, False))
+    assert np.all(one.pose_sigma < 1.5 * other.pose_sigma)
+    assert one.sigma_rotation.min() > 2 * other.sigma_rotation.max()
+
+
+@pytest.mark.slow
 def test_the_reprojection_error_is_that_of_opencv():
     """One camera of the same parameters; where images hardly tell tilt and principal point apart, they may differ."""
     (view,) = target_images(tilted_pair(TILTS)[:1], TARGET, NOISE, 14)

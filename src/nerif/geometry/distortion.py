@@ -78,8 +78,9 @@ def tilt(x: Array, y: Array, angles: Iterable[Any]) -> tuple[Array, Array, tuple
     across, down, shear = math.tan(b) / math.cos(a), -math.tan(a), -math.tan(a) * math.tan(b)
     w = 1 + across * x + down * y
     xt, yt = x / (w * math.cos(b)), (y / math.cos(a) + shear * x) / w
-    along_x = (1 / math.cos(b) - across * xt) / w, -down * xt / w
-    return xt, yt, (*along_x, (shear - across * yt) / w, (1 / math.cos(a) - down * yt) / w)
+    xx, xy = (1 / math.cos(b) - across * xt) / w, -down * xt / w
+    yx, yy = (shear - across * yt) / w, (1 / math.cos(a) - down * yt) / w
+    return xt, yt, (xx, xy, yx, yy)
 
 
 def tilt_slopes(x: Array, y: Array, angles: Iterable[Any]) -> tuple[Array, Array, Array, Array]:

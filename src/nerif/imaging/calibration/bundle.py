@@ -4,8 +4,8 @@
 
 over cameras i and target poses j; one pose is fixed and defines the world. Weak priors hold the parameters that a
 narrow lens does not separate from a rotation: the principal point near the middle of the image, distortion near 0.
-Without distortion, a tilt of the sensor about one axis is a shift of the principal point with other fx and fy, so the
-prior of that point determines it.
+Without distortion, a tilt of the sensor is exactly a rotation of the camera, a shift of the principal point and a
+shorter focal length; then the prior of that point determines it.
 
 Each step of the Levenberg-Marquardt method solves the normal equations exactly, so nearly degenerate parameters
 converge too. Parameters that no image constrains, such as the depth of a telecentric camera, stay at their initial
@@ -152,7 +152,9 @@ class Bundle:
         xt, yt, slopes = tilt(xd, yd, k[9:])
         by_distorted = k[:2, None] * _rows(*slopes)
         by_image = by_distorted @ _rows(xx, cross, cross, yy)
-        by_place = np.stack([np.stack(slope(*by_image[:, i].T, image, local), axis=-1) for i in range(2)], axis=1)
+        by_place = np.stack([
+            np.stack(slope(by_image[:, i, 0], by_image[:, i, 1], image, local), axis=-1) for i in range(2)
+        ], axis=1)  # fmt: skip
         by_turn = by_place @ np.tensordot(points, turn.reshape(3, 3, 3), axes=(1, 2)).transpose(0, 2, 1)
         by_joint = np.concatenate([by_turn, by_place], axis=-1).reshape(-1, POSE)
         r2, zero, one = x * x + y * y, np.zeros_like(x), np.ones_like(x)

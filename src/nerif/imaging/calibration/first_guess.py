@@ -199,8 +199,8 @@ def _perspective_view(view: ViewImages, tilted: bool) -> tuple[np.ndarray, Poses
     _, k, coefficients, rotations, translations = best
     vectors = (np.concatenate([r.ravel(), t.ravel()]) for r, t in zip(rotations, translations, strict=True))
     poses = dict(zip(images, map(Pose.of_vector, vectors), strict=True))
-    focal, middle, tilt = k.diagonal()[:2], k[:2, 2], coefficients[12:] if tilted else np.zeros(len(TILT))
-    return np.concatenate([focal, middle, np.zeros(len(COEFFICIENTS)), tilt]), poses
+    tilt = coefficients[12:] if tilted else np.zeros(len(TILT))
+    return np.concatenate([k.diagonal()[:2], k[:2, 2], np.zeros(len(COEFFICIENTS)), tilt]), poses
 
 
 def _consensus(estimates: dict[str, Pose], name: str) -> Pose:

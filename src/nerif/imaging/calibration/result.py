@@ -105,7 +105,7 @@ class Calibration:
     sigma_focal : (camera,) relative standard deviation of the focal length or scale
     sigma_tilt : (camera, 2) standard deviations of the tilt, degrees; 0 where it was not determined
     residuals : per camera (n, 4) u, v and the residuals in u, v, px
-    pose_sigma : (camera, 6) of a Camera, from noise alone, or None
+    pose_sigma : (camera, 6) of a Camera, from noise alone and for the tilt as it is, or None
     mount : standard deviations of position (mm) and rotation (degrees) to add to those of noise
     """
 
@@ -148,7 +148,7 @@ class Calibration:
             residuals.append(np.concatenate([np.hstack([o.detection.pixels, bundle.residual(o)]) for o in images]))
             points = [bundle.poses[o.pose].apply(o.detection.points) for o in images if o.on_background]
             backgrounds.append(_background(bundle.cameras[i], points, background_distance))
-        poses = covariance[:, INTRINSIC:, INTRINSIC:]
+        poses = _at_fixed_tilt(covariance)
         sigma = np.sqrt(np.maximum(np.diagonal(covariance, axis1=1, axis2=2), 0))
         return cls(
             names=tuple(names),
@@ -240,7 +240,7 @@ class Calibration:
                 raise InputError(
                     f"expected square pixels and a principal point near the image, got fx = {fx:.5g}, fy = {fy:.5g} "
                     f"{self.projection.unit}, cx = {cx:.5g}, cy = {cy:.5g} px; take more target images, tilted in "
-                    "different ways and filling the image",
+                    "different ways and filling the image; if the sensor is tilted (Scheimpflug), add --scheimpflug",
                     field=f"view '{name}'",
                 )
             plane = self.backgrounds[i]
@@ -265,6 +265,13 @@ class Calibration:
             "image": [{"name": e.name, "rms_px": e.rms, "points": e.points, "used": e.used} for e in self.errors],
         }
         write_cameras(path, self.cameras, about, box)
+
+
+def _at_fixed_tilt(covariance: Float[np.ndarray, "camera 17 17"]) -> Float[np.ndarray, "camera 6 6"]:
+    """Covariance of the poses for the tilts as they are: an error of a tilt and of its pose together move no ray."""
+    tilt, pose = slice(9, INTRINSIC), slice(INTRINSIC, None)
+    along = covariance[:, pose, tilt] @ np.linalg.pinv(covariance[:, tilt, tilt], hermitian=True)
+    return np.asarray(covariance[:, pose, pose] - along @ covariance[:, tilt, pose])
 
 
 def _pose_sigma(camera: Pose, covariance: Float[np.ndarray, "6 6"]) -> Float[np.ndarray, 6]:
