@@ -39,7 +39,7 @@ def test_file_is_plain_netcdf_and_read_as_written(full, tmp_path):
         assert dataset.attrs["ambient_faces"] == "x- z+"
         formats = variables()
         others = {name for k in TECHNIQUES.values() if k is not Deflection for name in (k.measured, k.sigma, *k.beside)}
-        later = {"aperture_diameter", "focus_distance", "window", "pose_sigma"}
+        later = {"aperture_diameter", "focus_distance", "window", "pose_sigma", "tilt"}
         assert set(dataset.data_vars) == set(formats) - later - others
         for name in dataset.data_vars:
             assert (dataset[name].dims, dataset[name].attrs["units"]) == formats[name]
@@ -58,6 +58,19 @@ def test_file_is_plain_netcdf_and_read_as_written(full, tmp_path):
         assert torch.allclose(a.background.normal, b.background.normal, atol=1e-15)
         assert a.background.offset == pytest.approx(b.background.offset)
     assert not list(tmp_path.glob("*.part"))
+
+
+def test_the_tilt_of_sensors_is_read_as_written(full, tmp_path):
+    tilt = torch.tensor([[0.05, -0.02], [0.0, 0.0], [0.1, 0.03]], dtype=torch.float64)
+    cameras = tuple(replace(c, tilt=t) for c, t in zip(full.cameras, tilt, strict=True))
+    replace(full, cameras=cameras).write(tmp_path / "m.nc")
+    assert torch.equal(torch.stack([c.tilt for c in Measurement.read(tmp_path / "m.nc").cameras]), tilt)
+    dataset = xr.load_dataset(tmp_path / "m.nc")
+    assert dataset.attrs["Conventions"] == "BOST-1.1"  # a reader of 1.0 would trace other rays
+    dataset["tilt"].attrs["units"] = "degrees"
+    dataset.to_netcdf(tmp_path / "degrees.nc", engine="h5netcdf")
+    with refused("variable 'tilt'"):
+        Measurement.read(tmp_path / "degrees.nc")
 
 
 def test_optional_variables_may_be_missing(full, tmp_path):

@@ -1,15 +1,16 @@
-"""The camera of either projection in general position: distorted, turned, with an oblique background."""
+"""The camera of either projection in general position: distorted, turned, with an oblique background; Scheimpflug."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
 from nerif.geometry import PROJECTIONS, Box, Camera, Plane, projection_named
-from nerif.geometry.camera import distort, fold, undistort
+from nerif.geometry.distortion import distort, fold, undistort
 from refusals import refused
 
 F64 = torch.float64
@@ -21,20 +22,22 @@ K = {
 DISTORTION = {"perspective": [-0.21, 0.09, 1.2e-3, -0.8e-3, 0.02], "telecentric": [-4e-7, 2e-12, 3e-6, -2e-6, 1e-17]}
 
 
-@pytest.fixture(params=sorted(PROJECTIONS))
+@pytest.fixture(params=[*sorted(PROJECTIONS), "scheimpflug"])
 def camera(request, rotation_about) -> Camera:
+    kind, angles = (request.param, (0.0, 0.0)) if request.param in PROJECTIONS else ("perspective", (6.0, -4.0))
     rotation = rotation_about((0.4, 1.0, -0.3), 0.7)
     centre = torch.tensor([-300.0, 120.0, -500.0], dtype=F64)
     forward = rotation[2]
     tilted = rotation_about((1.0, 0.2, 0.4), 0.4) @ forward
     return Camera(
-        intrinsics=torch.tensor(K[request.param], dtype=F64),
+        intrinsics=torch.tensor(K[kind], dtype=F64),
         rotation=rotation,
         translation=-rotation @ centre,
         image_size=(130, 200),
         background=Plane(tilted, float(tilted @ (centre + 1100 * forward))),
-        distortion=torch.tensor(DISTORTION[request.param], dtype=F64),
-        projection=PROJECTIONS[request.param],
+        distortion=torch.tensor(DISTORTION[kind], dtype=F64),
+        projection=PROJECTIONS[kind],
+        tilt=torch.tensor(angles, dtype=F64).deg2rad(),
     )
 
 
@@ -73,8 +76,10 @@ def test_projection_against_the_formulae_written_out(camera):
     radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
     xd = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
     yd = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
-    k = camera.intrinsics
+    k, (a, b) = camera.intrinsics, camera.tilt.tolist()
     assert abs(xd - x) > 1e-3 * abs(x)  # the distortion counts
+    across, down = [math.cos(b), math.sin(a) * math.sin(b), -math.cos(a) * math.sin(b)], [0, math.cos(a), math.sin(a)]
+    xd, yd, _ = np.linalg.solve(np.transpose([across, down, [-xd, -yd, -1]]), [0, 0, -1])  # where the sensor is met
     u, v = float(k[0, 0]) * xd + float(k[0, 1]) * yd + 95.3, float(k[1, 1]) * yd + 61.7
     assert camera.project(point).tolist() == pytest.approx([u, v], abs=1e-9)
 
@@ -166,6 +171,8 @@ def test_pixel_grid_is_column_then_row(camera):
         ("translation", lambda c: c.translation * math.nan),
         ("image_size", lambda c: (0, 10)),
         ("pose_sigma", lambda c: -torch.ones(6, dtype=F64)),
+        ("tilt", lambda c: torch.tensor([5.0, 0.0], dtype=F64)),  # degrees
+        ("tilt", lambda c: torch.tensor([math.nan, 0.0], dtype=F64)),
     ],
 )
 def test_cameras_that_cannot_be(camera, name, change):

@@ -11,6 +11,7 @@ from nerif.geometry import PROJECTIONS, Box, Camera, Lens, Plane, Rays
 from nerif.geometry.pose import GEOMETRY, Corrections, rotation_matrix
 
 BOX = Box((-25.0,) * 3, (25.0,) * 3)
+TILTS = (0.15, 0.0), (0.0, -0.1)  # rad
 
 
 def camera(projection: str, lens: Lens | None, turn: float) -> Camera:
@@ -34,6 +35,8 @@ def test_rays_move_as_those_of_the_corrected_cameras(projection, lens, backgroun
     if not background and (lens is None or lens.focus is None):
         lens = None
     cameras = [camera(projection, lens, turn) for turn in (0.0, 0.5)]
+    if projection == "perspective":  # about one axis of the sensor each: of two, a zoom is exact to second order
+        cameras = [replace(c, tilt=torch.tensor(a, dtype=torch.float64)) for c, a in zip(cameras, TILTS, strict=True)]
     if not background:
         cameras = [replace(c, background=None) for c in cameras]
     sizes = torch.tensor([0.01] * 3 + [2.0] * 3 + [0.02, 5.0], dtype=torch.float64)

@@ -5,14 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
 from calibration_images import detection, target_images
+from nerif.common.files import read_toml
 from nerif.geometry import PROJECTIONS, TELECENTRIC, Camera, Plane, Ring
-from nerif.imaging.calibration.bundle import Bundle, Observation, Pose, _Layout, adjust
+from nerif.imaging.calibration.bundle import INTRINSIC, Bundle, Observation, Pose, _Layout, adjust
 from nerif.imaging.calibration.calibrate import CalibrationSettings, _on_side, calibrate
 from nerif.imaging.calibration.cameras_file import read_cameras
 from nerif.imaging.calibration.first_guess import first_guess, mirror
@@ -259,6 +261,7 @@ def test_a_wrong_number_of_squares_and_a_large_error_are_refused():
         ({"projection": "fisheye"}, "projection"),
         ({"projection": "telecentric", "side": None}, "side"),
         ({"projection": "telecentric", "side": (NAMES[0], "left")}, "side"),
+        ({"projection": "telecentric", "side": (NAMES[0], "x+"), "scheimpflug": True}, "scheimpflug"),
     ],
 )
 def test_invalid_settings(change, field, unchecked):
@@ -273,6 +276,58 @@ def test_names_of_views_and_poses_that_are_none():
         calibrate(images(poses=4), replace(SETTINGS["perspective"], world="77"))
     with refused("side"):
         calibrate(images("telecentric"), replace(SETTINGS["telecentric"], side=("cam9", "x+")))
+
+
+# -- Scheimpflug ---------------------------------------------------------------------------------------------------
+
+TILTS = np.array([[6.0, -8.0], [-9.0, 2.5]])  # degrees
+SCHEIMPFLUG = replace(SETTINGS["perspective"], scheimpflug=True, axes=world_axes(CAMERAS[1:3]))
+
+
+def tilted_pair(tilts: np.ndarray) -> tuple[Camera, ...]:
+    pairs = zip(CAMERAS[1:3], np.radians(tilts), strict=True)
+    return tuple(replace(camera, tilt=torch.from_numpy(tilt)) for camera, tilt in pairs)
+
+
+@pytest.mark.parametrize("tilts", [TILTS, pytest.param(0 * TILTS, marks=pytest.mark.slow)])
+def test_tilts_come_back_within_their_standard_deviations_also_of_0(tmp_path, tilts):
+    cameras = tilted_pair(tilts)
+    result = calibrate(target_images(cameras, TARGET, NOISE, 10), SCHEIMPFLUG)
+    assert result.rms() == pytest.approx(NOISE * np.sqrt(2), rel=0.05)
+    errors = (result.tilt - tilts) / result.sigma_tilt
+    assert np.abs(errors).max() < 3.5
+    assert 0.1 < result.sigma_tilt.min() < result.sigma_tilt.max() < 1.0
+    points = torch.from_numpy(np.random.default_rng(0).uniform(-20, 20, (50, 3)))
+    for camera, calibrated in zip(cameras, result.cameras, strict=True):
+        whole = calibrated.camera(background=camera.background)
+        assert float((whole.project(points) - camera.project(points)).abs().max()) < NOISE
+    result.write(tmp_path / "c.toml")
+    cameras, about = read_cameras(tmp_path / "c.toml"), read_toml(tmp_path / "c.toml")["about"]
+    assert np.allclose(np.degrees(np.stack([c.tilt.numpy() for c in cameras])), result.tilt, atol=1e-12)
+    assert list(about["sigma_tilt_deg"].values()) == result.sigma_tilt.tolist()
+
+
+@pytest.mark.slow
+def test_pose_sigma_is_for_the_tilt_as_it_is():
+    """The prior of a refinement, which keeps the tilt: about that of a calibration without it."""
+    views = target_images(tilted_pair(TILTS), TARGET, NOISE, 10)
+    one, other = (calibrate(views, replace(SCHEIMPFLUG, scheimpflug=s)) for s in (True, False))
+    assert np.all(one.pose_sigma < 1.5 * other.pose_sigma)
+    assert one.sigma_rotation.min() > 2 * other.sigma_rotation.max()
+
+
+@pytest.mark.slow
+def test_the_reprojection_error_is_that_of_opencv():
+    """One camera of the same parameters; where images hardly tell tilt and principal point apart, they may differ."""
+    (view,) = target_images(tilted_pair(TILTS)[:1], TARGET, NOISE, 14)
+    result = calibrate([view], SCHEIMPFLUG)
+    images = [*view.poses.values(), *view.background.values()]
+    points, pixels = ([getattr(d, name).astype(np.float32) for d in images] for name in ("points", "pixels"))
+    k = np.array([[1700.0, 0, 249.5], [0, 1700.0, 199.5], [0, 0, 1]])
+    flags = cv2.CALIB_TILTED_MODEL | cv2.CALIB_FIX_K3 | cv2.CALIB_USE_INTRINSIC_GUESS
+    flags |= sum(getattr(cv2, f"CALIB_FIX_{name}") for name in ("K4", "K5", "K6"))
+    rms, *_ = cv2.calibrateCamera(points, pixels, (500, 400), k, np.zeros(14), flags=flags)
+    assert result.rms() == pytest.approx(rms, rel=2e-3)
 
 
 # -- telecentric: two rotations per image, and the mirror image of the rig -----------------------------------------
@@ -324,7 +379,7 @@ def small(kind: str) -> tuple[Bundle, list[Observation]]:
         common = sorted(set(views[0].poses) & set(views[1].poses))[:3]
         views = [replace(v, poses={n: v.poses[n] for n in common}) for v in views]
         bundle, observations = first_guess(views, ("k1", "k2", "p1", "p2", "k3"), common[0], TELECENTRIC)
-        bundle.intrinsics[:, 4:] = (1e-6, 1e-10, 1e-6, 2e-6, 1e-14)
+        bundle.intrinsics[:, 4:9] = (1e-6, 1e-10, 1e-6, 2e-6, 1e-14)
         return bundle, observations
     pair = CAMERAS[1:3]
     poses = target_poses(pair, TARGET, 4, seed=3)
@@ -333,12 +388,15 @@ def small(kind: str) -> tuple[Bundle, list[Observation]]:
         for i, camera in enumerate(pair)
         for j, pose in enumerate(poses)
     ]
-    k = np.array([[c.intrinsics[0, 0], c.intrinsics[1, 1], 250, 200, 0, 0, 0, 0, 0] for c in pair], dtype=float)
+    k = np.array([[c.intrinsics[0, 0], c.intrinsics[1, 1], 250, 200, *np.zeros(7)] for c in pair], dtype=float)
     cameras = tuple(Pose(c.rotation.numpy(), c.translation.numpy() + 1.0) for c in pair)
-    return Bundle(k, cameras, tuple(poses), 0, (True,) * 8 + (False,), ((400, 500),) * 2), observations
+    tilted = kind == "scheimpflug"
+    k[:, 9:] = [(0.1, -0.07), (-0.05, 0.2)] if tilted else 0
+    free = (*(True,) * 8, False, *(tilted,) * 2)
+    return Bundle(k, cameras, tuple(poses), 0, free, ((400, 500),) * 2), observations
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", [*KINDS, "scheimpflug"])
 def test_normal_equations_are_the_slope_of_the_cost(kind):
     bundle, observations = small(kind)
     layout = _Layout(bundle, observations, noise=10.0)  # in the quadratic part of Huber's loss
@@ -365,7 +423,7 @@ def test_adjustment_ends_in_a_minimum():
     rng = np.random.default_rng(0)
     spread = np.where(np.abs(x) > 0, np.abs(x), 1.0)
     assert all(layout.cost(x + 1e-4 * spread * rng.standard_normal(len(x))) > minimum for _ in range(20))
-    assert np.all(np.diagonal(covariance, axis1=1, axis2=2)[:, 9:] > 0)
+    assert np.all(np.diagonal(covariance, axis1=1, axis2=2)[:, INTRINSIC:] > 0)
 
 
 def test_poses_compose_and_invert():

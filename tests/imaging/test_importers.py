@@ -42,6 +42,7 @@ def make(name: str, seed: int) -> Camera:
 
 
 ONE, TWO = make("one", 1), make("two", 2)
+TILTED = dataclasses.replace(make("tilted", 4), tilt=torch.tensor([0.08, -0.11], dtype=torch.float64))
 PARALLEL = dataclasses.replace(
     make("parallel", 3),
     intrinsics=torch.tensor([[4.1, 0, 101.25], [0, 4.0, 77.5], [0, 0, 1]], dtype=torch.float64),
@@ -89,10 +90,10 @@ def refuse(path: Path, words: str, pose: int = 1) -> None:
 
 def test_calibration_file_keeps_every_bit(tmp_path):
     path = tmp_path / "c.toml"
-    write(path, ONE, TWO, PARALLEL, about={"rms_px": 0.02})
-    for got, camera in zip(import_cameras(path), (ONE, TWO, PARALLEL), strict=True):
+    write(path, ONE, TWO, PARALLEL, TILTED, about={"rms_px": 0.02})
+    for got, camera in zip(import_cameras(path), (ONE, TWO, PARALLEL, TILTED), strict=True):
         assert got.projection == got.camera().projection == camera.projection
-        for name in ("intrinsics", "rotation", "translation", "distortion"):
+        for name in ("intrinsics", "rotation", "translation", "distortion", "tilt"):
             assert torch.equal(getattr(got, name), getattr(camera, name))
         assert got.image_size == camera.image_size
         assert got.background is not None
@@ -113,6 +114,8 @@ def test_calibration_file_keeps_every_bit(tmp_path):
         (('name = "one"', 'name = "one"\nprojection = "fisheye"'), "'one': projection: expected one of perspective"),
         (('format = "nerif-calibration-1"', 'format = "other"'), "expected format = 'nerif-calibration-1'"),
         (("[[camera]]", "[[camera"), "not a TOML file"),
+        (('name = "one"', 'name = "one"\ntilt = [5.0, 0.0]'), "tilt of view 'one': .* below 45 degrees, in rad"),
+        (('name = "one"', 'name = "one"\ntilt = 0.1'), "camera 'one': tilt: expected 2 numbers, got a single number"),
     ],
 )
 def test_errors_in_a_calibration_file_name_file_camera_and_key(tmp_path, change, words):
@@ -234,6 +237,10 @@ def test_plain_toml(tmp_path):
     assert got[0].background.offset == pytest.approx(-900.0)
     path.write_text(path.read_text().replace("K = ", "k = "))
     refuse(path, "unknown key 'k'")
+    path.write_text(tomli_w.dumps({"tilted": table_of(TILTED, **more, tilt=TILTED.tilt.tolist())}))
+    assert same(import_cameras(path), TILTED)
+    path.write_text(path.read_text() + 'projection = "telecentric"\n')
+    refuse(path, "tilt of view 'tilted': expected none for a telecentric camera.*fx, fy and skew")
 
 
 def row_of(camera: Camera, **more: Any) -> dict[str, Any]:
@@ -242,18 +249,19 @@ def row_of(camera: Camera, **more: Any) -> dict[str, Any]:
     row |= {f"r{i + 1}{j + 1}": r[i][j] for i in range(3) for j in range(3)}
     row |= dict(zip(("tx", "ty", "tz"), camera.translation.tolist(), strict=True))
     row |= dict(zip(("k1", "k2", "p1", "p2", "k3"), camera.distortion.tolist(), strict=True))
+    row |= dict(zip(("tau_x", "tau_y"), camera.tilt.tolist(), strict=True))
     return row | {"height": 160, "width": 200, "nx": 0, "ny": 0, "nz": -1, "offset": -900} | more
 
 
 @pytest.mark.parametrize("delimiter", [",", ";"])
 def test_csv(tmp_path, delimiter):
     path = tmp_path / "c.csv"
-    rows = [row_of(c) for c in (ONE, TWO)]
+    rows = [row_of(c) for c in (TILTED, TWO)]
     lines = ["# from the spreadsheet", delimiter.join(rows[0])]
     lines += [delimiter.join(str(v) for v in row.values()) for row in rows]
     path.write_text("\n".join(lines) + "\n", encoding="utf-8-sig")
     got = import_cameras(path)
-    assert same(got, ONE, TWO)
+    assert same(got, TILTED, TWO)
     assert got[1].image_size == (160, 200)
     assert got[0].background is not None
     text = "\n".join(lines)
@@ -314,6 +322,22 @@ def test_opencv_folders_and_numbered_cameras(tmp_path):
     assert same(import_cameras(tmp_path / "both.xml"), ONE, TWO)
     write_opencv(tmp_path / "more.yml", BOTH)
     refuse(tmp_path, "more.yml: expected cameras of .*, got 'cam1' here and in both.xml")
+
+
+def test_opencv_tilt_is_the_end_of_14_coefficients(tmp_path):
+    path, table, values = tmp_path / "c.yml", tmp_path / "c.toml", arrays(TILTED)
+    coefficients = np.concatenate([values["D"], np.zeros(7), TILTED.tilt.numpy()])
+    for shape in ((1, 14), (14, 1)):
+        write_opencv(path, {**values, "D": coefficients.reshape(shape)})
+        assert same(import_cameras(path), TILTED)
+    for i in (5, 9):  # k4, s2
+        other = coefficients + 0.01 * (np.arange(14) == i)
+        write_opencv(path, {**values, "D": other})
+        refuse(path, "the tilt tau_x tau_y, got 14 with others that are not 0")
+    write_opencv(path, {**values, "tauX": 0.08})
+    refuse(path, "got 'tauX', which is not read")
+    table.write_text(tomli_w.dumps({"a": table_of(TILTED, tilt=[0.0, 0.1]) | {"distortion": coefficients.tolist()}}))
+    refuse(table, "camera 'a': tilt: expected it once")
 
 
 @pytest.mark.parametrize("suffix", [".yml", ".xml"])

@@ -101,6 +101,7 @@ OTHER = {
     "background": Plane(torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64), -400.0),
     "translation": torch.tensor([0.0, 0.001, 900.0], dtype=torch.float64),
     "distortion": torch.tensor([1e-6, 0, 0, 0, 0], dtype=torch.float64),
+    "tilt": torch.tensor([1e-6, 0], dtype=torch.float64),
     "lens": Lens(3.0),
     "pose_sigma": torch.ones(6, dtype=torch.float64),
 }

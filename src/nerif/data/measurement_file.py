@@ -36,6 +36,7 @@ RIG = {
     "flow_mask": (PIXELS, "1"),
     "intrinsics": (("view", "i", "j"), "px"),
     "distortion": (("view", "coefficient"), "1"),
+    "tilt": (("view", "axis"), "rad"),
     "rotation": (("view", "i", "j"), "1"),
     "translation": (("view", "i"), "mm"),
     "background_normal": (("view", "i"), "1"),
@@ -51,7 +52,7 @@ RIG = {
 MASKS = ("valid", "flow_mask")
 REQUIRED = ("intrinsics", "rotation", "translation", "box")
 BACKGROUND = ("background_normal", "background_offset")
-SIZES = {"i": 3, "j": 3, "coefficient": 5, "corner": 2, "side": 2, "parameter": 6}
+SIZES = {"i": 3, "j": 3, "coefficient": 5, "axis": 2, "corner": 2, "side": 2, "parameter": 6}
 SPELLINGS = {"px/mm": "px mm-1"}
 MAX_PIXELS = 1 << 32  # of all views; a damaged file may claim any number
 
@@ -121,6 +122,8 @@ def to_dataset(measurement: Measurement) -> xr.Dataset:
         data["aperture_diameter"] = np.array([lens.diameter for lens in lenses])
     if any(lens.focus is not None for lens in lenses):
         data["focus_distance"] = np.array([np.nan if lens.focus is None else lens.focus for lens in lenses])
+    if any(bool(c.tilt.any()) for c in cameras):
+        data["tilt"] = stack([c.tilt for c in cameras])
     if any(c.pose_sigma is not None for c in cameras):
         none = torch.full((6,), torch.nan, dtype=torch.float64)
         data["pose_sigma"] = stack([none if c.pose_sigma is None else c.pose_sigma for c in cameras])
@@ -136,7 +139,7 @@ def to_dataset(measurement: Measurement) -> xr.Dataset:
         dataset = dataset.assign_coords(component=list(COMPONENTS))
     names = [kind.name for kind in measurement.techniques]
     pinholes = all(c.projection == PERSPECTIVE for c in cameras)
-    plain = names == [Deflection.name] and pinholes and not lenses and "pose_sigma" not in data
+    plain = names == [Deflection.name] and pinholes and not lenses and not data.keys() & {"pose_sigma", "tilt"}
     dataset.attrs = {
         "Conventions": PLAIN if plain else CONVENTIONS,
         **({} if plain else {"technique": " ".join(names)}),
@@ -290,7 +293,7 @@ def _cameras(dataset: xr.Dataset) -> tuple[Camera, ...]:
     views, names, projections = dataset.sizes["view"], _names(dataset), _projections(dataset)
     whole = torch.tensor([dataset.sizes["row"], dataset.sizes["column"]], dtype=torch.float64).expand(views, 2)
     sizes = _array(dataset, "image_size") if "image_size" in dataset else whole
-    distortion = _optional(dataset, "distortion", (views, 5), 0.0)
+    distortion, tilt = (_optional(dataset, n, (views, k), 0.0) for n, k in (("distortion", 5), ("tilt", 2)))
     intrinsics, rotation, translation = (_array(dataset, n) for n in ("intrinsics", "rotation", "translation"))
     normals = _optional(dataset, "background_normal", (views, 3))
     offsets = _optional(dataset, "background_offset", (views,))
@@ -311,6 +314,7 @@ def _cameras(dataset: xr.Dataset) -> tuple[Camera, ...]:
                 projection=projections[i],
                 lens=lenses[i],
                 pose_sigma=None if bool(pose_sigma[i].isnan().all()) else pose_sigma[i],
+                tilt=tilt[i],
             )
         )
     return tuple(cameras)

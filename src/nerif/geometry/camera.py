@@ -1,103 +1,37 @@
-"""The camera: a perspective or telecentric projection with five distortion coefficients, looking at a background plane.
+"""The camera: a projection, the distortion of its lens and the tilt of its sensor, looking at a background plane.
 
-    x_cam = R x_world + t,   (x, y) = projection(x_cam) distorted by (k1, k2, p1, p2, k3),   pixel = K (x, y, 1)
+    x_cam = R x_world + t,   (x, y) = projection(x_cam),   pixel = K (x_t, y_t, 1)
 
     perspective    (x, y) = (X/Z, Y/Z)    rays through the optical centre; K holds focal lengths, px
     telecentric    (x, y) = (X, Y)        rays parallel to the optical axis; K holds px per mm
 
-Distortion, with r^2 = x^2 + y^2:
-
-    x_d = x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2)
-    y_d = y (1 + k1 r^2 + k2 r^4 + k3 r^6) + p1 (r^2 + 2 y^2) + 2 p2 x y
-
-Source: D. C. Brown, Close-range camera calibration, Photogramm. Eng. 37 (1971); conventions of OpenCV.
+with (x_t, y_t) of (x, y) by distortion and tilt (distortion.py). Conventions of OpenCV.
 """
 
 from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, TypeVar
+from typing import ClassVar
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from nerif.common.conventions import LARGEST_LENGTH, InputError, Matrix3, Pixels, Points, Values
+from nerif.geometry.distortion import UPRIGHT, Array, from_sensor, to_sensor
 from nerif.geometry.lens import Lens, LensDiscs
 from nerif.geometry.rays import BackgroundPoints, Rays
 
 __all__ = [
-    "PERSPECTIVE", "POWERS", "PROJECTIONS", "TELECENTRIC", "Camera", "Perspective", "Plane", "Projection",
-    "Telecentric", "distort", "fold", "projection_named", "undistort",
+    "PERSPECTIVE", "PROJECTIONS", "TELECENTRIC", "Camera", "Perspective", "Plane", "Projection", "Telecentric",
+    "projection_named",
 ]  # fmt: skip
 
-POWERS = (2, 4, 1, 1, 6)
-"""Units of k1, k2, p1, p2, k3: inverse powers of that of (x, y)."""
-MAX_IMAGINARY = 1e-6  # part of a real root, over its absolute value
-MAX_START, MAX_STEP = 0.9, 0.25  # of Newton's method, over the radius of the fold
+MAX_TILT = 45.0  # degrees
 MAX_IMAGE_EDGE = 100_000  # px
 LATTICE = 33  # pixels along either edge that represent an image
-
-Array = TypeVar("Array", Tensor, np.ndarray)
-
-
-def distort(x: Array, y: Array, coefficients: Iterable[Any]) -> tuple[Array, Array, tuple[Array, Array, Array]]:
-    """Return x_d, y_d and their derivatives d x_d / d x, d x_d / d y = d y_d / d x, d y_d / d y."""
-    k1, k2, p1, p2, k3 = coefficients
-    r2 = x * x + y * y
-    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    slope = 2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3))  # d radial / d r2, times 2
-    xd = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
-    yd = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
-    cross = slope * x * y + 2 * p1 * x + 2 * p2 * y
-    xx = radial + slope * x * x + 2 * p1 * y + 6 * p2 * x
-    yy = radial + slope * y * y + 6 * p1 * y + 2 * p2 * x
-    return xd, yd, (xx, cross, yy)
-
-
-def fold(coefficients: Float[Tensor, 5]) -> float:
-    """Return the radius below which the distortion is invertible; infinity without a limit.
-
-    Beyond it the polynomial folds the image back. It is invertible as long as the matrix of derivatives, which is
-    symmetric, is positive definite. Its lowest eigenvalue is at least
-
-        1 + 3 k1 r^2 + 5 k2 r^4 + 7 k3 r^6 - 6 (p1^2 + p2^2)^(1/2) r
-    """
-    k1, k2, p1, p2, k3 = coefficients.tolist()
-    roots = np.roots([7 * k3, 0.0, 5 * k2, 0.0, 3 * k1, -6 * math.hypot(p1, p2), 1.0])
-    real = roots.real[(roots.real > 0) & (np.abs(roots.imag) < MAX_IMAGINARY * np.abs(roots))]
-    return float(real.min(initial=math.inf))
-
-
-def undistort(distorted: Pixels, coefficients: Float[Tensor, 5]) -> Pixels:
-    """Return the coordinates before distortion by Newton's method, at most 20 steps; NaN if there are none."""
-    if not (distorted.numel() and bool(coefficients.any())):
-        return distorted
-    end = fold(coefficients)
-    size = max(1.0, float(distorted.abs().amax()))
-    x, y = _within(distorted[..., 0], distorted[..., 1], MAX_START * end)
-    for _ in range(20):
-        xd, yd, (xx, cross, yy) = distort(x, y, coefficients)
-        dx, dy = distorted[..., 0] - xd, distorted[..., 1] - yd
-        if float(torch.maximum(dx.abs(), dy.abs()).amax()) < 1e-14 * size:
-            break
-        determinant = xx * yy - cross * cross
-        step = (yy * dx - cross * dy) / determinant, (xx * dy - cross * dx) / determinant
-        dx, dy = _within(step[0], step[1], MAX_STEP * end)
-        x, y = _within(x + dx, y + dy, end)
-    xd, yd, _ = distort(x, y, coefficients)
-    error = (distorted - torch.stack([xd, yd], dim=-1)).abs().amax(dim=-1, keepdim=True)
-    return torch.where(error < 1e-9 * size, torch.stack([x, y], dim=-1), torch.nan)
-
-
-def _within(x: Tensor, y: Tensor, radius: float) -> tuple[Tensor, Tensor]:
-    """The vector (x, y), shortened to at most this length."""
-    share = (radius / torch.hypot(x, y)).clamp(max=1)
-    return x * share, y * share
 
 
 class Projection(ABC):
@@ -241,6 +175,8 @@ class Camera:
     lens : the aperture through which a pixel sees; None for one thin ray per pixel
     pose_sigma : (6,) standard deviations of the rotation about its own axes (rad) and of the shift of its centre along
         them (mm), or None
+    tilt : (2,) OpenCV's tau_x, tau_y of the sensor behind a Scheimpflug lens, rad; of a perspective camera only, since
+        for parallel rays fx, fy and skew describe it
     """
 
     intrinsics: Matrix3
@@ -253,6 +189,7 @@ class Camera:
     projection: Projection = PERSPECTIVE
     lens: Lens | None = None
     pose_sigma: Float[Tensor, 6] | None = None
+    tilt: Float[Tensor, 2] = UPRIGHT
 
     def __post_init__(self) -> None:
         def check(name: str, valid: bool, expected: str, got: object, remedy: str = "") -> None:
@@ -281,6 +218,12 @@ class Camera:
         upper = abs(float(k[2, 2]) - 1) <= 1e-9 and not float(k[2, :2].abs().max()) and not float(k[1, 0])
         remedy = "; a transposed K (MATLAB) has to be transposed back"
         check("intrinsics", upper, "K = [[fx, s, cx], [0, fy, cy], [0, 0, 1]]", k.tolist(), remedy)
+        remedy = "; give degrees times pi / 180"
+        valid = bool((torch.rad2deg(self.tilt).abs() < MAX_TILT).all())
+        check("tilt", valid, f"angles below {MAX_TILT:g} degrees, in rad", self.tilt.tolist(), remedy)
+        remedy = "; remove it, since fx, fy and skew describe a tilted sensor where rays are parallel"
+        valid = kind.shows_depth or not bool(self.tilt.any())
+        check("tilt", valid, f"none for a {kind.name} camera", self.tilt.tolist(), remedy)
         valid = min(self.image_size) > 0 and max(self.image_size) <= MAX_IMAGE_EDGE
         check("image_size", valid, f"(height, width) between 1 and {MAX_IMAGE_EDGE} px", self.image_size)
         if (sigma := self.pose_sigma) is not None:
@@ -314,7 +257,7 @@ class Camera:
         return self.projection.distance(self.local(points))
 
     def pixel_size(self, points: Points) -> Values:
-        """Return the width of a pixel at world points (mm), across the optical axis, mm."""
+        """Return the width of a pixel at world points (mm), across the axis, mm; without distortion and tilt."""
         return 1 / (self.intrinsics[0, 0] * self.projection.magnification(self.local(points)))
 
     @property
@@ -365,7 +308,7 @@ class Camera:
         k = self.intrinsics
         y = (pixels[..., 1] - k[1, 2]) / k[1, 1]
         x = (pixels[..., 0] - k[0, 2] - k[0, 1] * y) / k[0, 0]
-        ideal = undistort(torch.stack([x, y], dim=-1), self.distortion)
+        ideal = from_sensor(torch.stack([x, y], dim=-1), self.distortion, self.tilt)
         start, heading = self.projection.lines(ideal)
         direction = heading @ self.rotation
         direction = direction / direction.norm(dim=-1, keepdim=True)
@@ -446,12 +389,10 @@ class Camera:
         """Pixels and d pixel / d X (px/mm)."""
         local = self.local(points)
         image, slope = self.projection.image(local), self.projection.slope
-        folded = image.norm(dim=-1, keepdim=True) > fold(self.distortion)
-        valid = image.masked_fill(folded, torch.nan)
-        x, y, (xx, cross, yy) = distort(valid[..., 0], valid[..., 1], self.distortion)
+        x, y, (xx, xy, yx, yy) = to_sensor(image, self.distortion, self.tilt)
         k = self.intrinsics
         pixels = torch.stack([k[0, 0] * x + k[0, 1] * y + k[0, 2], k[1, 1] * y + k[1, 2]], dim=-1)
         # row by row: small matrix products are slow in a batch
-        u = slope(k[0, 0] * xx + k[0, 1] * cross, k[0, 0] * cross + k[0, 1] * yy, image, local)
-        v = slope(k[1, 1] * cross, k[1, 1] * yy, image, local)
+        u = slope(k[0, 0] * xx + k[0, 1] * yx, k[0, 0] * xy + k[0, 1] * yy, image, local)
+        v = slope(k[1, 1] * yx, k[1, 1] * yy, image, local)
         return pixels, torch.stack([*u, *v], dim=-1).unflatten(-1, (2, 3)) @ self.rotation

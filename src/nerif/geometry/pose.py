@@ -18,7 +18,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerif.geometry.camera import POWERS, Camera, Plane
+from nerif.geometry.camera import Camera, Plane
+from nerif.geometry.distortion import POWERS
 from nerif.geometry.grid import Box
 from nerif.geometry.rays import BackgroundPoints, Rays
 
@@ -106,7 +107,8 @@ def _corrected_camera(camera: Camera, values: Float[Tensor, 8]) -> Camera:
     rotation = rotation_matrix(turn) @ camera.rotation.double()
     centre = camera.centre.double() + camera.rotation.double().T @ shift
     scale = torch.ones(3, 3, dtype=torch.float64)
-    scale[:2, :2] = zoom  # the principal point stays
+    tilt, cosines = _zoomed(camera.tilt.double(), zoom)
+    scale[:2, :2] = zoom * cosines.flip(0)  # the principal point stays
     powers = torch.tensor(POWERS, dtype=torch.float64)
     plane = camera.background
     if plane is not None:
@@ -116,7 +118,19 @@ def _corrected_camera(camera: Camera, values: Float[Tensor, 8]) -> Camera:
         camera,
         intrinsics=(camera.intrinsics.double() * scale).to(camera.intrinsics),
         distortion=(camera.distortion.double() * zoom**powers).to(camera.distortion),
+        tilt=tilt.to(camera.tilt),
         rotation=rotation.to(kind),
         translation=(-rotation @ centre).to(kind),
         background=plane,
     )
+
+
+def _zoomed(tilt: Float[Tensor, 2], zoom: Float[Tensor, ""]) -> tuple[Float[Tensor, 2], Float[Tensor, 2]]:
+    """Tilt of a sensor that sees the image (x, y) / zoom as one of this tilt sees (x, y), and the ratio of the cosines.
+
+    Exact for a tilt about one axis; of two a shear of 2 k tan(tau_x) tan(tau_y) is neglected.
+    """
+    first = torch.atan(zoom * tilt[0].tan())
+    second = torch.atan(zoom * tilt[1].tan() * first.cos() / tilt[0].cos())
+    result = torch.stack([first, second])
+    return result, result.cos() / tilt.cos()

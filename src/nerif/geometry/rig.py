@@ -11,7 +11,7 @@ import torch
 
 from nerif.common.conventions import InputError
 from nerif.common.settings import Count, Length, check_settings
-from nerif.geometry.camera import PROJECTIONS, Camera, Plane, Projection, projection_named
+from nerif.geometry.camera import MAX_TILT, PROJECTIONS, Camera, Plane, Projection, projection_named
 from nerif.geometry.grid import Box
 
 __all__ = ["Ring", "paper_rig"]
@@ -39,6 +39,8 @@ class Ring:
     """Pixel pitch of the sensor, mm."""
     image_size: tuple[Count, Count] = (200, 200)
     """Image height and width, px."""
+    sensor_tilt: tuple[float, float] = (0.0, 0.0)
+    """Tilt of the sensors about their x and y, of Scheimpflug lenses, degrees below 45."""
     distance: Length = 700.0
     """Distance from the lens to the centre of the box, mm."""
     background_distance: Length = 500.0
@@ -46,9 +48,11 @@ class Ring:
 
     def __post_init__(self) -> None:
         check_settings(self)
-        for name in ("arc", "extra_angles", "elevation"):
+        for name in ("arc", "extra_angles", "elevation", "sensor_tilt"):
             if not math.isfinite(math.fsum(np.atleast_1d(getattr(self, name)))):
                 raise InputError(f"expected degrees, got {getattr(self, name)}", field=name)
+        if max(map(abs, self.sensor_tilt)) >= MAX_TILT:
+            raise InputError(f"expected below {MAX_TILT:g} degrees, got {self.sensor_tilt}", field="sensor_tilt")
         if self.magnification is not None and self.kind.shows_depth:
             raise InputError(f"expected projection = telecentric, got {self.projection}", field="magnification")
 
@@ -98,6 +102,7 @@ class Ring:
             distortion=torch.zeros(5, dtype=torch.float64),
             name=name,
             projection=self.kind,
+            tilt=torch.deg2rad(torch.tensor(self.sensor_tilt, dtype=torch.float64)),
         )
 
 

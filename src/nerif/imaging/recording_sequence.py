@@ -184,6 +184,7 @@ def _camera_numbers(camera: Camera) -> dict[str, Tensor]:
         "rotation": camera.rotation,
         "translation": camera.translation,
         "distortion": camera.distortion,
+        "tilt": camera.tilt,
         "background": [*camera.plane.normal.tolist(), camera.plane.offset],
         "lens": [lens.diameter, torch.nan if lens.focus is None else lens.focus],
         "pose_sigma": sigma,

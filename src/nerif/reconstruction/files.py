@@ -79,10 +79,11 @@ def check_fingerprint(before: dict[str, str] | None, present: dict[str, str]) ->
 
 def _parts(camera: Camera) -> tuple[Any, ...]:
     plane = camera.background
-    optics = (camera.projection.name, camera.intrinsics, camera.rotation, camera.translation, camera.distortion)
+    optics = camera.projection.name, camera.intrinsics, camera.rotation, camera.translation, camera.distortion
+    tilt = (camera.tilt,) if bool(camera.tilt.any()) else ()
     lens: tuple[Any, ...] = () if camera.lens is None else (camera.lens.diameter, camera.lens.focus)
     lens += (camera.lens.window,) if camera.lens is not None and camera.lens.window else ()
-    return (*optics, camera.image_size, *(() if plane is None else (plane.normal, plane.offset)), *lens)
+    return (*optics, *tilt, camera.image_size, *(() if plane is None else (plane.normal, plane.offset)), *lens)
 
 
 def digest(parts: Iterable[Any]) -> str:

@@ -115,6 +115,8 @@ class Experiment:
             "target": asdict(self.target_for(cameras)),
             **_lens_settings(cameras[0]),
         }
+        if any(bool(camera.tilt.any()) for camera in cameras):
+            settings["scheimpflug"] = True
         if not cameras[0].projection.shows_depth:
             settings["projection"] = cameras[0].projection.name
             settings["side"] = side_of_one(cameras)

@@ -162,6 +162,11 @@ def _print(calibration: Calibration) -> None:
             f"{calibration.sigma_focal[i]:>8.2%}{calibration.sigma_rotation[i]:>9.4f} deg"
             f"{calibration.sigma_translation[i]:>10.3f} mm" + (f"{plane.rms:>13.3f} mm" if plane else f"{'none':>16}")
         )
+    if calibration.sigma_tilt.any():
+        say(f"{'camera':<12}{'tilt of the sensor about its x [deg]':>38}{'about its y [deg]':>24}")
+        for name, angles, sigma in zip(calibration.names, calibration.tilt, calibration.sigma_tilt, strict=True):
+            x, y = (f"{angle:.3f} +- {s:.3f}" for angle, s in zip(angles, sigma, strict=True))
+            say(f"{name:<12}{x:>38}{y:>24}")
     for note in calibration.notes:
         say(f"note: {note}")
 

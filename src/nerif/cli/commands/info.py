@@ -80,6 +80,9 @@ def _measurement(path: Path, m: Measurement) -> None:
     for camera in m.cameras:
         if camera.unseen:
             say(f"  distortion     not invertible for {camera.unseen:.1%} of the pixels of '{camera.name}'")
+    tilt = math.degrees(max(float(c.tilt.abs().max()) for c in m.cameras))
+    if tilt:
+        say(f"  sensor tilt    {tilt:.3g} deg or less (Scheimpflug)")
     lenses = {c.lens for c in m.cameras if c.lens is not None}
     for edge in sorted({lens.window for lens in lenses if lens.window}):
         say(f"  window         {edge:g} px, over which displacements are averaged")

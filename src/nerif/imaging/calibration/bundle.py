@@ -4,6 +4,8 @@
 
 over cameras i and target poses j; one pose is fixed and defines the world. Weak priors hold the parameters that a
 narrow lens does not separate from a rotation: the principal point near the middle of the image, distortion near 0.
+Without distortion, a tilt of the sensor is exactly a rotation of the camera, a shift of the principal point and a
+shorter focal length; then the prior of that point determines it.
 
 Each step of the Levenberg-Marquardt method solves the normal equations exactly, so nearly degenerate parameters
 converge too. Parameters that no image constrains, such as the depth of a telecentric camera, stay at their initial
@@ -21,18 +23,18 @@ import numpy as np
 from jaxtyping import Float
 
 from nerif.geometry import PERSPECTIVE, Projection
-from nerif.geometry.camera import POWERS, distort
+from nerif.geometry.distortion import POWERS, distort, tilt, tilt_slopes
 from nerif.imaging.calibration.targets import Detection
 
-__all__ = ["COEFFICIENTS", "Bundle", "Observation", "Pose", "adjust", "crossing"]
+__all__ = ["COEFFICIENTS", "INTRINSIC", "TILT", "Bundle", "Observation", "Pose", "adjust", "crossing"]
 
-COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")
+COEFFICIENTS, TILT = ("k1", "k2", "p1", "p2", "k3"), ("tau_x", "tau_y")
 HUBER = 5  # residual over noise beyond which the loss is linear
 PRINCIPAL_SIGMA = 0.03  # of the principal point from the middle of the image, over the image width
 DISTORTION_SIGMA = (0.5, 5.0, 0.005, 0.005, 5.0)  # of COEFFICIENTS; of a telecentric camera with (x, y) over
 HALF_WIDTHS = 5  # times half the image width in mm: as for a perspective image that is 23 degrees wide
 MIN_EIGENVALUE = 1e-13  # of the curvature, over its largest: directions below it change no image
-INTRINSIC, POSE = 9, 6  # parameters: fx, fy, cx, cy and five of distortion; rotation vector, translation
+INTRINSIC, POSE = 11, 6  # parameters: fx, fy, cx, cy, five of distortion, two of tilt; rotation vector, translation
 
 
 @dataclass(frozen=True)
@@ -111,15 +113,16 @@ class Bundle:
 
     Parameters
     ----------
-    intrinsics : (camera, 9) fx, fy, cx, cy (px; fx, fy of telecentric cameras px/mm), k1, k2, p1, p2, k3
+    intrinsics : (camera, 11) fx, fy, cx, cy (px; fx, fy of telecentric cameras px/mm), k1, k2, p1, p2, k3, and of the
+        sensor tau_x, tau_y (rad)
     cameras : world to camera
     poses : target to world
     fixed : index of the pose that defines the world
-    free : (9,) which intrinsics are adjusted
+    free : (11,) which intrinsics are adjusted
     sizes : (height, width) of each camera's images, px
     """
 
-    intrinsics: Float[np.ndarray, "camera 9"]
+    intrinsics: Float[np.ndarray, "camera 11"]
     cameras: tuple[Pose, ...]
     poses: tuple[Pose, ...]
     fixed: int
@@ -131,7 +134,7 @@ class Bundle:
         """Return the points of an observation by the model, px."""
         k, pose = self.intrinsics[o.camera], self.cameras[o.camera] @ self.poses[o.pose]
         image = self.projection.image(pose.apply(o.detection.points))
-        x, y, _ = distort(image[:, 0], image[:, 1], k[4:])
+        x, y, _ = tilt(*distort(image[:, 0], image[:, 1], k[4:9])[:2], k[9:])
         return np.stack([k[0] * x + k[2], k[1] * y + k[3]], axis=1)
 
     def derivatives(self, o: Observation) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -145,17 +148,25 @@ class Bundle:
         local = points @ rotation.T + t.ravel()
         image, slope = self.projection.image(local), self.projection.slope
         x, y = image.T
-        xd, yd, (xx, cross, yy) = distort(x, y, k[4:])
+        xd, yd, (xx, cross, yy) = distort(x, y, k[4:9])
+        xt, yt, slopes = tilt(xd, yd, k[9:])
+        by_distorted = k[:2, None] * _rows(*slopes)
+        by_image = by_distorted @ _rows(xx, cross, cross, yy)
         by_place = np.stack([
-            np.stack(slope(k[0] * xx, k[0] * cross, image, local), axis=-1),
-            np.stack(slope(k[1] * cross, k[1] * yy, image, local), axis=-1),
+            np.stack(slope(by_image[:, i, 0], by_image[:, i, 1], image, local), axis=-1) for i in range(2)
         ], axis=1)  # fmt: skip
         by_turn = by_place @ np.tensordot(points, turn.reshape(3, 3, 3), axes=(1, 2)).transpose(0, 2, 1)
         by_joint = np.concatenate([by_turn, by_place], axis=-1).reshape(-1, POSE)
         r2, zero, one = x * x + y * y, np.zeros_like(x), np.ones_like(x)
-        u = (xd, zero, one, zero, *(k[0] * c for c in (x * r2, x * r2**2, 2 * x * y, r2 + 2 * x * x, x * r2**3)))
-        v = (zero, yd, zero, one, *(k[1] * c for c in (y * r2, y * r2**2, r2 + 2 * y * y, 2 * x * y, y * r2**3)))
-        by_intrinsics = np.stack([np.stack(u, axis=-1), np.stack(v, axis=-1)], axis=1).reshape(-1, INTRINSIC)
+        coefficients = _rows(
+            x * r2, x * r2**2, 2 * x * y, r2 + 2 * x * x, x * r2**3,
+            y * r2, y * r2**2, r2 + 2 * y * y, 2 * x * y, y * r2**3,
+        )  # fmt: skip
+        by_intrinsics = np.concatenate([
+            _rows(xt, zero, one, zero, zero, yt, zero, one),
+            by_distorted @ coefficients,
+            k[:2, None] * _rows(*tilt_slopes(xd, yd, k[9:])),
+        ], axis=-1).reshape(-1, INTRINSIC)  # fmt: skip
         by_camera = by_joint @ np.block([[drdb, drdtb], [dtdb, dtdtb]])
         return by_intrinsics, by_camera, by_joint @ np.block([[drda, drdta], [dtda, dtdta]])
 
@@ -170,10 +181,10 @@ class Bundle:
 
 def adjust(
     bundle: Bundle, observations: Sequence[Observation], noise: float, iterations: int = 100
-) -> tuple[Bundle, Float[np.ndarray, "camera 15 15"]]:
+) -> tuple[Bundle, Float[np.ndarray, "camera 17 17"]]:
     """Return the adjusted bundle, and the covariance of each camera's parameters.
 
-    The covariances (9 intrinsics, rotation about the camera's own axes in rad, translation in mm) follow from the
+    The covariances (11 intrinsics, rotation about the camera's own axes in rad, translation in mm) follow from the
     curvature of the sum and the residuals; they include detection noise, not a target that is not flat.
 
     Parameters
@@ -216,6 +227,11 @@ def crossing(vector: Float[np.ndarray, 3]) -> Float[np.ndarray, "3 3"]:
     """Return [v]x, by which v x a = [v]x a."""
     x, y, z = vector
     return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+
+
+def _rows(*columns: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 2 m"]:
+    """Matrices of two rows, from their entries row by row."""
+    return np.stack(columns, axis=-1).reshape(len(columns[0]), 2, -1)
 
 
 def _scale(curvature: np.ndarray) -> np.ndarray:
@@ -295,7 +311,7 @@ class _Layout:
     def _prior(self, bundle: Bundle) -> np.ndarray:
         """Principal point from the middle of the image, and distortion, over their sigma, times the noise."""
         middle = np.array([((w - 1) / 2, (h - 1) / 2) for h, w in bundle.sizes])
-        off = np.concatenate([bundle.intrinsics[:, 2:4] - middle, bundle.intrinsics[:, 4:]], axis=1)
+        off = np.concatenate([bundle.intrinsics[:, 2:4] - middle, bundle.intrinsics[:, 4:9]], axis=1)
         return off * self._prior_slopes()
 
     def _prior_slopes(self) -> np.ndarray:

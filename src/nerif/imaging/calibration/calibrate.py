@@ -18,7 +18,7 @@ from nerif.common.conventions import FACES, InputError
 from nerif.common.files import check_known
 from nerif.common.settings import Positive, check_settings
 from nerif.geometry import PROJECTIONS, Projection, projection_named
-from nerif.imaging.calibration.bundle import COEFFICIENTS, Bundle, Observation, Pose, adjust, crossing
+from nerif.imaging.calibration.bundle import COEFFICIENTS, TILT, Bundle, Observation, Pose, adjust, crossing
 from nerif.imaging.calibration.first_guess import first_guess, mirror
 from nerif.imaging.calibration.result import Calibration
 from nerif.imaging.calibration.target_images import find_targets, pose_names
@@ -40,6 +40,8 @@ class CalibrationSettings:
     """Projection of all cameras: perspective or telecentric."""
     distortion: tuple[str, ...] = ("k1", "k2", "p1", "p2")
     """Distortion coefficients to determine, from k1 k2 p1 p2 k3; the others are 0."""
+    scheimpflug: bool = False
+    """Determine the two tilt angles of each sensor, of lenses on Scheimpflug adapters; perspective only."""
     world: str = ""
     """Name of the target pose that defines the world frame; default: the one that most cameras see."""
     axes: tuple[str, str, str] = ("x+", "z+", "y-")
@@ -59,6 +61,12 @@ class CalibrationSettings:
                     f"expected coefficients from {' '.join(COEFFICIENTS)}, got '{name}'", field="distortion"
                 )
         check_settings(self)
+        if self.scheimpflug and not self.kind.shows_depth:
+            raise InputError(
+                f"expected perspective, got {self.projection}; leave it out, since fx and fy of parallel rays describe "
+                "a sensor tilted about its rows or columns",
+                field="scheimpflug",
+            )
         if not self.kind.shows_depth and (self.side is None or self.side[1] not in FACES):
             raise InputError(
                 f"expected a view and the side of the world on which it stands ({' '.join(FACES)}), such as cam1 x+, "
@@ -82,6 +90,11 @@ class CalibrationSettings:
     def kind(self) -> Projection:
         """Projection of the cameras."""
         return projection_named(self.projection)
+
+    @property
+    def coefficients(self) -> tuple[str, ...]:
+        """Coefficients of distortion and tilt to determine."""
+        return (*self.distortion, *(TILT if self.scheimpflug else ()))
 
     @property
     def rotation(self) -> Float[np.ndarray, "3 3"]:
@@ -147,7 +160,7 @@ def calibrate(
     settings.check_names(names)
     if not settings.kind.shows_depth:
         views = [replace(v, background={}) for v in views]
-    bundle, observations = first_guess(views, settings.distortion, settings.world, settings.kind)
+    bundle, observations = first_guess(views, settings.coefficients, settings.world, settings.kind)
     bundle, _ = adjust(bundle, observations, INITIAL_NOISE)
     fits = _fits(bundle, observations)
     consistent = [o for o, fit in zip(observations, fits, strict=True) if fit]
@@ -198,8 +211,8 @@ def _on_side(bundle: Bundle, settings: CalibrationSettings, names: Sequence[str]
 
 
 def _to_world(
-    bundle: Bundle, covariance: Float[np.ndarray, "camera 15 15"], settings: CalibrationSettings
-) -> tuple[Bundle, Float[np.ndarray, "camera 15 15"]]:
+    bundle: Bundle, covariance: Float[np.ndarray, "camera 17 17"], settings: CalibrationSettings
+) -> tuple[Bundle, Float[np.ndarray, "camera 17 17"]]:
     """From the frame of the fixed target to the world of the settings; an unconstrained depth is 0 there."""
     move, shows = Pose(settings.rotation, np.array(settings.origin)), np.diag([1, 1, bundle.projection.shows_depth])
     cameras, blocks = [], []

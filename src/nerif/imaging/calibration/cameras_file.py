@@ -8,6 +8,7 @@ projection = "perspective"              # optional; or "telecentric"
 image_size = [200, 240]                 # optional: height, width, px
 intrinsics = [[fx, s, cx], [0, fy, cy], [0, 0, 1]]    # px; fx, s, fy of a telecentric camera px/mm
 distortion = [k1, k2, p1, p2, k3]       # optional
+tilt = [tau_x, tau_y]                   # optional: of the sensor behind a Scheimpflug lens, rad
 rotation = [[...], [...], [...]]        # world to camera
 translation = [tx, ty, tz]              # mm
 aperture_diameter = 6.25                # optional: diameter of the entrance pupil, mm; without it, thin rays
@@ -35,6 +36,7 @@ from torch import Tensor
 from nerif.common.conventions import InputError, Matrix3
 from nerif.common.files import check_known, read_toml, write_toml
 from nerif.geometry import PERSPECTIVE, Box, Camera, Lens, Plane, Projection, projection_named
+from nerif.geometry.distortion import UPRIGHT
 
 __all__ = [
     "FORMAT", "CalibratedCamera", "check_camera", "check_distortion", "check_model", "check_names", "flat",
@@ -43,10 +45,11 @@ __all__ = [
 
 FORMAT = "nerif-calibration-1"
 ARRAYS = ("intrinsics", "distortion", "rotation", "translation")
-KEYS = ("name", "projection", "image_size", *ARRAYS, "background", "aperture_diameter", "focus_distance", "pose_sigma")
+LENS = ("aperture_diameter", "focus_distance")
+KEYS = ("name", "projection", "image_size", *ARRAYS, "tilt", "background", *LENS, "pose_sigma")
 BROWN = ("brown", "opencv", "perspective", "pinhole", "plumb_bob", "radial", "simple_pinhole", "simple_radial")
 """Names that programs give to camera models with Brown's distortion (k1, k2, p1, p2, k3)."""
-LIKE_DISTORTION = re.compile("(?<!un)dist(?!an)", re.IGNORECASE)  # neither undistorted images nor distances
+LIKE_DISTORTION = re.compile("(?<!un)dist(?!an)|^tau_?[xy]|tilt", re.IGNORECASE)  # not undistorted images, distances
 
 
 @dataclass(frozen=True)
@@ -63,6 +66,7 @@ class CalibratedCamera:
     projection: Projection = PERSPECTIVE
     lens: Lens | None = None
     pose_sigma: Float[Tensor, 6] | None = None
+    tilt: Float[Tensor, 2] = UPRIGHT
 
     def camera(self, image_size: tuple[int, int] | None = None, background: Plane | None = None) -> Camera:
         """Return the Camera, with this image size (px) and background where they are given."""
@@ -80,7 +84,7 @@ class CalibratedCamera:
     def from_values(
         cls, where: str, name: str, intrinsics: Any, rotation: Any, translation: Any, distortion: Any = None,
         image_size: Any = None, background: tuple[Any, Any] | None = None, projection: Any = PERSPECTIVE.name,
-        lens: Lens | None = None, pose_sigma: Any = None,
+        lens: Lens | None = None, pose_sigma: Any = None, tilt: Any = None,
     ) -> CalibratedCamera:  # fmt: skip
         """Return a camera from the numbers of a file, after checking their shapes; errors start with `where`.
 
@@ -88,21 +92,27 @@ class CalibratedCamera:
         ----------
         intrinsics : (3, 3) K, or its transpose (MATLAB)
         translation : 3 numbers in any arrangement
-        distortion : up to 14 coefficients of OpenCV, of which those after the fifth have to be 0; None for none
+        distortion : up to 14 coefficients of OpenCV, of which the sixth to twelfth have to be 0; None for none
         image_size : height and width, px
         background : normal of any length, and offset, mm
+        tilt : tau_x, tau_y, rad, the last two of 14 coefficients
         """
+        coefficients, last = _coefficients(distortion, f"{where}: distortion")
+        if tilt is not None and bool(last.any()):
+            got = f"got {last.tolist()} in distortion too"
+            raise InputError(f"expected it once, {got}; remove one", field=f"{where}: tilt")
         return cls(
             name=name,
             intrinsics=_upright(numbers(intrinsics, (3, 3), f"{where}: intrinsics")),
             rotation=numbers(rotation, (3, 3), f"{where}: rotation"),
             translation=numbers(flat(translation, f"{where}: translation"), (3,), f"{where}: translation"),
-            distortion=_five(distortion, f"{where}: distortion"),
+            distortion=coefficients,
             image_size=None if image_size is None else _size(image_size, f"{where}: image_size"),
             background=None if background is None else _plane(*background, f"{where}: background"),
             projection=projection_named(projection, f"{where}: projection"),
             lens=lens,
             pose_sigma=None if pose_sigma is None else numbers(pose_sigma, (6,), f"{where}: pose_sigma"),
+            tilt=last if tilt is None else numbers(tilt, (2,), f"{where}: tilt"),
         )
 
 
@@ -159,17 +169,19 @@ def _plane(normal: Any, offset: Any, name: str) -> Plane:
     return Plane(direction / length, float(numbers(offset, (), f"{name}: offset")) / length)
 
 
-def _five(coefficients: Any, name: str) -> Tensor:
+def _coefficients(coefficients: Any, name: str) -> tuple[Tensor, Tensor]:
+    """The first five of OpenCV's coefficients, and the last two of all 14."""
     vector = flat([] if coefficients is None else coefficients, name)
     if not np.isfinite(vector).all():
         raise InputError(f"expected finite numbers as distortion coefficients, got {coefficients!r}", field=name)
-    if np.any(vector[5:] != 0):
+    whole = np.concatenate([vector, np.zeros(max(0, 14 - len(vector)))])
+    if whole[5:12].any() or whole[14:].any():
         raise InputError(
-            f"expected at most 5 distortion coefficients (k1 k2 p1 p2 k3), got {len(vector)}; calibrate again "
-            "without the rational, thin-prism and tilted models",
+            "expected at most 5 distortion coefficients (k1 k2 p1 p2 k3) and, as the last of 14, the tilt tau_x tau_y, "
+            f"got {len(vector)} with others that are not 0; calibrate again without the rational and thin-prism models",
             field=name,
         )
-    return torch.from_numpy(np.concatenate([vector[:5], np.zeros(max(0, 5 - len(vector)))]))
+    return torch.from_numpy(whole[:5]), torch.from_numpy(whole[12:14].copy())
 
 
 def _upright(k: Tensor) -> Tensor:
@@ -226,6 +238,8 @@ def write_cameras(
         if camera.image_size is not None:
             table["image_size"] = list(camera.image_size)
         table |= {name: getattr(camera, name).tolist() for name in ARRAYS}
+        if bool(camera.tilt.any()):
+            table["tilt"] = camera.tilt.tolist()
         if camera.lens is not None:
             table["aperture_diameter"] = camera.lens.diameter
             if camera.lens.focus is not None:
@@ -271,7 +285,7 @@ def _camera(table: dict[str, Any], index: int, path: str) -> CalibratedCamera:
     for key in ("name", "intrinsics", "rotation", "translation"):
         if key not in table:
             raise InputError(f"'{key}' is missing", field=where)
-    values = {key: table[key] for key in table if key not in ("aperture_diameter", "focus_distance")}
+    values = {key: table[key] for key in table if key not in LENS}
     values |= {"name": str(table["name"]), "lens": _lens(table, where)}
     plane = table.get("background")
     if plane is not None:
@@ -282,10 +296,7 @@ def _camera(table: dict[str, Any], index: int, path: str) -> CalibratedCamera:
 
 
 def _lens(table: dict[str, Any], where: str) -> Lens | None:
-    diameter, focus = (
-        float(numbers(table[key], (), f"{where}: {key}")) if key in table else None
-        for key in ("aperture_diameter", "focus_distance")
-    )
+    diameter, focus = (float(numbers(table[key], (), f"{where}: {key}")) if key in table else None for key in LENS)
     if diameter is None:
         if focus is not None:
             raise InputError("focus_distance: expected together with aperture_diameter, got it alone", field=where)

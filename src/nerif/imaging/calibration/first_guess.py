@@ -22,7 +22,7 @@ from jaxtyping import Float
 
 from nerif.common.conventions import InputError
 from nerif.geometry import PERSPECTIVE, TELECENTRIC, Projection
-from nerif.imaging.calibration.bundle import COEFFICIENTS, Bundle, Observation, Pose
+from nerif.imaging.calibration.bundle import COEFFICIENTS, INTRINSIC, TILT, Bundle, Observation, Pose
 from nerif.imaging.calibration.targets import Detection, ViewImages
 
 __all__ = ["first_guess", "mirror"]
@@ -38,20 +38,20 @@ FLIP = np.diag([1.0, 1.0, -1.0])
 class Guess(NamedTuple):
     """Initial parameters.
 
-    intrinsics : (camera, 9) as those of a Bundle
+    intrinsics : (camera, 11) as those of a Bundle
     cameras : world to camera
     targets : target to world, of the poses that cameras share, by name
     on_background : target to world, of each camera's images of the target on its background, by name
     """
 
-    intrinsics: Float[np.ndarray, "camera 9"]
+    intrinsics: Float[np.ndarray, "camera 11"]
     cameras: tuple[Pose, ...]
     targets: Mapping[str, Pose]
     on_background: tuple[Mapping[str, Pose], ...]
 
 
 def first_guess(
-    views: Sequence[ViewImages], distortion: Sequence[str], world: str = "", projection: Projection = PERSPECTIVE
+    views: Sequence[ViewImages], coefficients: Sequence[str], world: str = "", projection: Projection = PERSPECTIVE
 ) -> tuple[Bundle, list[Observation]]:
     """Return a bundle to adjust, in the frame of one target pose, and all observations.
 
@@ -60,7 +60,7 @@ def first_guess(
 
     Parameters
     ----------
-    distortion : coefficients to be adjusted
+    coefficients : of distortion (COEFFICIENTS) and tilt (TILT), to be adjusted
     world : name of the target pose that defines the world; the one that most cameras see if empty
     """
     counts = Counter(name for view in views for name in view.poses)
@@ -72,7 +72,7 @@ def first_guess(
             f"expected a target pose with detections, one of {', '.join(names)}, got '{world}'", field="world"
         )
     world = world or max(names, key=lambda n: counts[n])
-    guess = GUESSES[projection](views, world)
+    guess = GUESSES[projection](views, world, any(name in coefficients for name in TILT))
     poses, observations = [guess.targets[n] for n in names], []
     for i, view in enumerate(views):
         for name, detection in view.poses.items():
@@ -86,7 +86,7 @@ def first_guess(
         cameras=guess.cameras,
         poses=tuple(poses),
         fixed=names.index(world),
-        free=(True, True, principal, principal, *(c in distortion for c in COEFFICIENTS)),
+        free=(True, True, principal, principal, *(c in coefficients for c in (*COEFFICIENTS, *TILT))),
         sizes=tuple(v.size for v in views),
         projection=projection,
     )
@@ -150,8 +150,8 @@ Poses = dict[tuple[str, bool], Pose]
 """Target to camera, by name and whether the target is on the background."""
 
 
-def _guess_perspective(views: Sequence[ViewImages], world: str) -> Guess:
-    intrinsics, local = zip(*(_perspective_view(view) for view in views), strict=True)
+def _guess_perspective(views: Sequence[ViewImages], world: str, tilted: bool) -> Guess:
+    intrinsics, local = zip(*(_perspective_view(view, tilted) for view in views), strict=True)
     targets = {world: Pose(np.eye(3), np.zeros(3))}
     cameras: dict[int, Pose] = {}
     while len(cameras) < len(views):
@@ -168,8 +168,8 @@ def _guess_perspective(views: Sequence[ViewImages], world: str) -> Guess:
     )
 
 
-def _perspective_view(view: ViewImages) -> tuple[np.ndarray, Poses]:
-    """Intrinsics of one camera, of which only the focal length is fitted, and its target poses."""
+def _perspective_view(view: ViewImages, tilted: bool) -> tuple[np.ndarray, Poses]:
+    """Intrinsics of one camera, of which only the focal length and a tilt are fitted, and its target poses."""
     import cv2
 
     images = {(n, False): d for n, d in view.poses.items()} | {(n, True): d for n, d in view.background.items()}
@@ -180,25 +180,27 @@ def _perspective_view(view: ViewImages) -> tuple[np.ndarray, Poses]:
     # principal point and distortion are left to the bundle adjustment: one camera alone hardly determines them
     flags = cv2.CALIB_FIX_PRINCIPAL_POINT | cv2.CALIB_FIX_ASPECT_RATIO | cv2.CALIB_ZERO_TANGENT_DIST
     flags |= cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3 | cv2.CALIB_USE_INTRINSIC_GUESS
+    flags |= cv2.CALIB_TILTED_MODEL if tilted else 0
     best = None
     for focal in FOCAL_LENGTHS:
         k = np.array([[focal * width, 0, (width - 1) / 2], [0, focal * width, (height - 1) / 2], [0, 0, 1]])
-        rms, k, _, rotations, translations = cv2.calibrateCamera(
-            points, pixels, (width, height), k, np.zeros(5), flags=flags
+        rms, k, coefficients, rotations, translations = cv2.calibrateCamera(
+            points, pixels, (width, height), k, np.zeros(14 if tilted else 5), flags=flags
         )
         in_front = all(float(t.ravel()[2]) > 0 for t in translations)
         if np.isfinite(rms) and in_front and (best is None or rms < best[0]):
-            best = (rms, k, rotations, translations)
+            best = (rms, k, coefficients.ravel(), rotations, translations)
     if best is None:
         raise InputError(
             f"no camera explains its {len(images)} target images; check the number of squares "
             "and that the target was tilted differently in them",
             field=f"view '{view.name}'",
         )
-    _, k, rotations, translations = best
+    _, k, coefficients, rotations, translations = best
     vectors = (np.concatenate([r.ravel(), t.ravel()]) for r, t in zip(rotations, translations, strict=True))
     poses = dict(zip(images, map(Pose.of_vector, vectors), strict=True))
-    return np.array([k[0, 0], k[1, 1], k[0, 2], k[1, 2], 0, 0, 0, 0, 0], dtype=np.float64), poses
+    tilt = coefficients[12:] if tilted else np.zeros(len(TILT))
+    return np.concatenate([k.diagonal()[:2], k[:2, 2], np.zeros(len(COEFFICIENTS)), tilt]), poses
 
 
 def _consensus(estimates: dict[str, Pose], name: str) -> Pose:
@@ -229,13 +231,13 @@ class _TelecentricView:
     places: Mapping[str, Float[np.ndarray, 2]]
 
 
-def _guess_telecentric(views: Sequence[ViewImages], world: str) -> Guess:
-    """Images of the target on the background are not used."""
+def _guess_telecentric(views: Sequence[ViewImages], world: str, _tilted: bool) -> Guess:
+    """Images of the target on the background are not used, nor is a tilt, which fx and fy describe."""
     local = [_telecentric_view(view) for view in views]
     cameras, targets = _telecentric_rotations(views, local, world)
     places, offsets = _telecentric_places(local, cameras, targets, world)
     return Guess(
-        np.stack([[a.scale, a.scale, *a.middle, 0, 0, 0, 0, 0] for a in local]),
+        np.stack([[a.scale, a.scale, *a.middle, *np.zeros(INTRINSIC - 4)] for a in local]),
         tuple(Pose(cameras[i], offsets[i]) for i in range(len(views))),
         {name: Pose(rotation, places[name]) for name, rotation in targets.items()},
         ({},) * len(views),
@@ -341,7 +343,7 @@ def _telecentric_places(
     return {**places, world: np.zeros(3)}, offsets
 
 
-GUESSES: dict[Projection, Callable[[Sequence[ViewImages], str], Guess]] = {
+GUESSES: dict[Projection, Callable[[Sequence[ViewImages], str, bool], Guess]] = {
     PERSPECTIVE: _guess_perspective,
     TELECENTRIC: _guess_telecentric,
 }

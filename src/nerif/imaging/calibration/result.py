@@ -14,7 +14,7 @@ from jaxtyping import Float
 from nerif.common.conventions import InputError
 from nerif.common.files import read_toml
 from nerif.geometry import PERSPECTIVE, Box, Lens, Plane, Projection
-from nerif.imaging.calibration.bundle import Bundle, Observation, Pose, crossing
+from nerif.imaging.calibration.bundle import INTRINSIC, Bundle, Observation, Pose, crossing
 from nerif.imaging.calibration.cameras_file import CalibratedCamera, write_cameras
 
 __all__ = ["MOUNT", "Calibration", "FittedPlane", "ImageError", "read_errors", "rms_of"]
@@ -97,26 +97,28 @@ class Calibration:
     Parameters
     ----------
     names, sizes : of the cameras and their images (height, width)
-    intrinsics : (camera, 9) as those of a Bundle
+    intrinsics : (camera, 11) as those of a Bundle
     poses : world to camera, mm
     errors : one per image
     sigma_rotation, sigma_translation : (camera,) standard deviations from noise alone, degrees and mm; the latter of
         telecentric cameras across the optical axis
     sigma_focal : (camera,) relative standard deviation of the focal length or scale
+    sigma_tilt : (camera, 2) standard deviations of the tilt, degrees; 0 where it was not determined
     residuals : per camera (n, 4) u, v and the residuals in u, v, px
-    pose_sigma : (camera, 6) of a Camera, from noise alone, or None
+    pose_sigma : (camera, 6) of a Camera, from noise alone and for the tilt as it is, or None
     mount : standard deviations of position (mm) and rotation (degrees) to add to those of noise
     """
 
     names: tuple[str, ...]
     sizes: tuple[tuple[int, int], ...]
-    intrinsics: Float[np.ndarray, "camera 9"]
+    intrinsics: Float[np.ndarray, "camera 11"]
     poses: tuple[Pose, ...]
     backgrounds: tuple[FittedPlane | None, ...]
     errors: tuple[ImageError, ...]
     sigma_rotation: Float[np.ndarray, " camera"]
     sigma_translation: Float[np.ndarray, " camera"]
     sigma_focal: Float[np.ndarray, " camera"]
+    sigma_tilt: Float[np.ndarray, "camera 2"]
     residuals: tuple[np.ndarray, ...]
     projection: Projection = PERSPECTIVE
     lens: Lens | None = None
@@ -125,7 +127,7 @@ class Calibration:
 
     @classmethod
     def of(
-        cls, names: Sequence[str], bundle: Bundle, covariance: Float[np.ndarray, "camera 15 15"],
+        cls, names: Sequence[str], bundle: Bundle, covariance: Float[np.ndarray, "camera 17 17"],
         observations: Sequence[Observation], used: Sequence[bool], background_distance: float | None = None,
     ) -> Calibration:  # fmt: skip
         """Return the result of an adjusted bundle in the world frame.
@@ -146,6 +148,7 @@ class Calibration:
             residuals.append(np.concatenate([np.hstack([o.detection.pixels, bundle.residual(o)]) for o in images]))
             points = [bundle.poses[o.pose].apply(o.detection.points) for o in images if o.on_background]
             backgrounds.append(_background(bundle.cameras[i], points, background_distance))
+        poses = _at_fixed_tilt(covariance)
         sigma = np.sqrt(np.maximum(np.diagonal(covariance, axis1=1, axis2=2), 0))
         return cls(
             names=tuple(names),
@@ -154,17 +157,23 @@ class Calibration:
             poses=bundle.cameras,
             backgrounds=tuple(backgrounds),
             errors=tuple(errors),
-            sigma_rotation=np.degrees(np.linalg.norm(sigma[:, 9:12], axis=1)),
-            sigma_translation=np.linalg.norm(sigma[:, 12:], axis=1),
+            sigma_rotation=np.degrees(np.linalg.norm(sigma[:, INTRINSIC : INTRINSIC + 3], axis=1)),
+            sigma_translation=np.linalg.norm(sigma[:, INTRINSIC + 3 :], axis=1),
             sigma_focal=sigma[:, 0] / bundle.intrinsics[:, 0],
+            sigma_tilt=np.degrees(sigma[:, 9:INTRINSIC]),
             residuals=tuple(residuals),
             projection=bundle.projection,
-            pose_sigma=np.stack([_pose_sigma(*one) for one in zip(bundle.cameras, covariance[:, 9:, 9:], strict=True)]),
+            pose_sigma=np.stack([_pose_sigma(*one) for one in zip(bundle.cameras, poses, strict=True)]),
         )
 
     def rms(self, camera: str | None = None) -> float:
         """Return the rms reprojection error over the images in use, of one camera or all, px."""
         return rms_of([e for e in self.errors if camera in (None, e.camera)])
+
+    @property
+    def tilt(self) -> Float[np.ndarray, "camera 2"]:
+        """Tilt of the sensors, degrees."""
+        return np.degrees(self.intrinsics[:, 9:])
 
     @property
     def cameras(self) -> tuple[CalibratedCamera, ...]:
@@ -179,12 +188,13 @@ class Calibration:
             intrinsics=torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64),
             rotation=torch.from_numpy(self.poses[i].rotation.copy()),
             translation=torch.from_numpy(self.poses[i].translation.copy()),
-            distortion=torch.from_numpy(self.intrinsics[i, 4:].copy()),
+            distortion=torch.from_numpy(self.intrinsics[i, 4:9].copy()),
             image_size=self.sizes[i],
             background=None if plane is None else Plane(torch.tensor(plane.normal, dtype=torch.float64), plane.offset),
             projection=self.projection,
             lens=self.lens,
             pose_sigma=None if self.pose_sigma is None else torch.from_numpy(np.hypot(self.pose_sigma[i], mount)),
+            tilt=torch.from_numpy(self.intrinsics[i, 9:].copy()),
         )
 
     @property
@@ -230,7 +240,7 @@ class Calibration:
                 raise InputError(
                     f"expected square pixels and a principal point near the image, got fx = {fx:.5g}, fy = {fy:.5g} "
                     f"{self.projection.unit}, cx = {cx:.5g}, cy = {cy:.5g} px; take more target images, tilted in "
-                    "different ways and filling the image",
+                    "different ways and filling the image; if the sensor is tilted (Scheimpflug), add --scheimpflug",
                     field=f"view '{name}'",
                 )
             plane = self.backgrounds[i]
@@ -243,16 +253,25 @@ class Calibration:
 
     def write(self, path: str | os.PathLike[str], box: Box | None = None) -> None:
         """Write a calibration file, with the errors under [about]."""
+        tilt = dict(zip(self.names, self.sigma_tilt.tolist(), strict=True))
         about = {
             "date": datetime.date.today().isoformat(),
             "rms_px": self.rms(),
             "camera_rms_px": {name: self.rms(name) for name in self.names},
             "sigma_rotation_deg": dict(zip(self.names, self.sigma_rotation.tolist(), strict=True)),
             "sigma_translation_mm": dict(zip(self.names, self.sigma_translation.tolist(), strict=True)),
+            **({"sigma_tilt_deg": tilt} if self.sigma_tilt.any() else {}),
             "notes": list(self.notes),
             "image": [{"name": e.name, "rms_px": e.rms, "points": e.points, "used": e.used} for e in self.errors],
         }
         write_cameras(path, self.cameras, about, box)
+
+
+def _at_fixed_tilt(covariance: Float[np.ndarray, "camera 17 17"]) -> Float[np.ndarray, "camera 6 6"]:
+    """Covariance of the poses for the tilts as they are: an error of a tilt and of its pose together move no ray."""
+    tilt, pose = slice(9, INTRINSIC), slice(INTRINSIC, None)
+    along = covariance[:, pose, tilt] @ np.linalg.pinv(covariance[:, tilt, tilt], hermitian=True)
+    return np.asarray(covariance[:, pose, pose] - along @ covariance[:, tilt, pose])
 
 
 def _pose_sigma(camera: Pose, covariance: Float[np.ndarray, "6 6"]) -> Float[np.ndarray, 6]:

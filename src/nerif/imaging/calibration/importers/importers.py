@@ -18,7 +18,7 @@ from annotated_types import Ge, Lt
 from nerif.common.conventions import InputError
 from nerif.common.settings import Positive, check_settings
 from nerif.geometry import Box, Lens, Plane
-from nerif.geometry.camera import POWERS
+from nerif.geometry.distortion import POWERS
 from nerif.imaging.calibration.cameras_file import CalibratedCamera, check_camera, check_names, read_box
 from nerif.imaging.calibration.importers.matlab import read_matlab
 from nerif.imaging.calibration.importers.nerfstudio import read_transforms

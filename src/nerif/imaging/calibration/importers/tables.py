@@ -13,11 +13,11 @@ from nerif.imaging.calibration.cameras_file import FORMAT, CalibratedCamera, rea
 
 __all__ = ["read_csv", "read_tables"]
 
-KEYS = ("K", "R", "t", "distortion", "image_size", "normal", "offset", "projection")
+KEYS = ("K", "R", "t", "distortion", "image_size", "normal", "offset", "projection", "tilt")
 REQUIRED = ("fx", "fy", "cx", "cy", *(f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)), "tx", "ty", "tz")
-DISTORTION = ("k1", "k2", "p1", "p2", "k3")
+DISTORTION, TILT = ("k1", "k2", "p1", "p2", "k3"), ("tau_x", "tau_y")
 TEXTS = ("name", "projection")
-COLUMNS = (*TEXTS, *REQUIRED, "s", *DISTORTION, "width", "height", "nx", "ny", "nz", "offset")
+COLUMNS = (*TEXTS, *REQUIRED, "s", *DISTORTION, *TILT, "width", "height", "nx", "ny", "nz", "offset")
 
 
 def read_tables(path: Path) -> list[CalibratedCamera]:
@@ -38,7 +38,7 @@ def read_tables(path: Path) -> list[CalibratedCamera]:
             CalibratedCamera.from_values(
                 where, name, table["K"], table["R"], table["t"], table.get("distortion"), table.get("image_size"),
                 (table["normal"], table["offset"]) if {"normal", "offset"} <= set(table) else None,
-                table.get("projection", PERSPECTIVE.name),
+                table.get("projection", PERSPECTIVE.name), tilt=table.get("tilt"),
             )
         )  # fmt: skip
     return cameras
@@ -64,7 +64,7 @@ def read_csv(path: Path) -> list[CalibratedCamera]:
 
 def _row(row: dict, number: int, path: Path) -> CalibratedCamera:
     cells = {str(k).strip(): str(v).strip() for k, v in row.items() if v is not None and str(v).strip()}
-    x: dict[str, float] = dict.fromkeys(("s", *DISTORTION), 0.0)
+    x: dict[str, float] = dict.fromkeys(("s", *DISTORTION, *TILT), 0.0)
     for key in (*REQUIRED, *(cells.keys() - {*REQUIRED, *TEXTS})):
         try:
             x[key] = float(cells.get(key, ""))
@@ -82,4 +82,5 @@ def _row(row: dict, number: int, path: Path) -> CalibratedCamera:
         size if "width" in x else None,
         (normal, x["offset"]) if "nx" in x and "offset" in x else None,
         cells.get("projection", PERSPECTIVE.name),
+        tilt=[x[k] for k in TILT],
     )
