@@ -48,7 +48,7 @@ def test_the_gas_is_that_of_the_run_unless_changed():
     assert GasChanges("N2").of({}) == GasSettings("N2")
 
 
-@pytest.mark.parametrize("ending", [".nc", ".vti"])
+@pytest.mark.parametrize("ending", [".nc", ".vti", ".NC", ".Vti"])
 def test_volumes_are_read_as_written(volumes, tmp_path, ending):
     path = tmp_path / f"v{ending}"
     export(path, volumes)

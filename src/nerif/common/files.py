@@ -15,10 +15,15 @@ from typing import Any
 
 from nerif.common.conventions import InputError
 
-__all__ = ["atomic", "check_known", "read_toml", "write_json", "write_toml", "written"]
+__all__ = ["atomic", "check_known", "ending", "read_toml", "write_json", "write_toml", "written"]
 
 written: list[Path] = []
 """Paths that this process has written, in order."""
+
+
+def ending(path: str | os.PathLike[str]) -> str:
+    """Return the ending of a file name in small letters, such as ".nc": cameras and copies may write .NC."""
+    return Path(path).suffix.lower()
 
 
 @contextmanager

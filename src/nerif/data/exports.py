@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from nerif.common.conventions import InputError
-from nerif.common.files import atomic
+from nerif.common.files import atomic, ending
 from nerif.data.volume import Volume
 from nerif.data.volume_file import write_netcdf
 from nerif.data.vti import write_vti
@@ -21,10 +21,9 @@ __all__ = ["FORMATS", "export", "write_csv", "write_mat", "write_npz"]
 
 def export(path: str | os.PathLike[str], volumes: list[Volume]) -> None:
     """Write volumes on one grid in the format of the ending of `path`, one of FORMATS."""
-    suffix = Path(path).suffix
-    if suffix not in FORMATS:
-        raise InputError(f"expected a name ending in {', '.join(FORMATS)}, got '{suffix}'", field=path)
-    FORMATS[suffix](path, volumes)
+    if ending(path) not in FORMATS:
+        raise InputError(f"expected a name ending in {', '.join(FORMATS)}, got '{Path(path).suffix}'", field=path)
+    FORMATS[ending(path)](path, volumes)
 
 
 def _write_vti(path: str | os.PathLike[str], volumes: list[Volume]) -> None:

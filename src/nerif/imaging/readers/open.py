@@ -15,12 +15,13 @@ import numpy as np
 from jaxtyping import Bool
 
 from nerif.common.conventions import InputError
+from nerif.common.files import ending
 from nerif.imaging.readers.array_files import ArrayFrames, Hdf5Frames
 from nerif.imaging.readers.frames import Frames, SelectedFrames, size_in_words
 from nerif.imaging.readers.image_files import FileFrames
 from nerif.imaging.readers.photron import PhotronFrames
 
-__all__ = ["FOLDER_SUFFIXES", "open_frames", "read_mask"]
+__all__ = ["FOLDER_SUFFIXES", "SUFFIXES", "open_frames", "read_mask"]
 
 FOLDER_SUFFIXES = (".tif", ".tiff", ".png", ".bmp", ".jpg", ".jpeg", ".im7")
 SINGLE_SUFFIXES = (".cih", ".cihx", ".mraw", ".npy", ".npz", ".h5", ".hdf5", ".hdf")
@@ -72,11 +73,11 @@ def read_mask(path: Path, shape: tuple[int, int]) -> Bool[np.ndarray, "row colum
 
 def _open_files(files: list[Path], names: list[str], dataset: str = "") -> Frames:
     for path, name in zip(files, names, strict=True):
-        if path.suffix.lower() not in SUFFIXES:
+        if ending(path) not in SUFFIXES:
             raise InputError(f"expected one of {' '.join(SUFFIXES)}, got '{path.suffix}'", field=name)
-        if len(files) > 1 and path.suffix.lower() in SINGLE_SUFFIXES:
+        if len(files) > 1 and ending(path) in SINGLE_SUFFIXES:
             raise InputError(f"one of {len(files)} files of a pattern; name one recording at a time", field=name)
-    match files[0].suffix.lower():
+    match ending(files[0]):
         case ".cih" | ".cihx" | ".mraw":
             return PhotronFrames(files[0], names[0])
         case ".h5" | ".hdf5" | ".hdf":
@@ -105,16 +106,19 @@ def _find_files(path: Path, base: Path | None) -> list[Path]:
     """Files of a file name, folder or pattern, in natural order."""
     label = _label(path, base)
     if path.is_dir():
-        files = [p for p in path.iterdir() if p.suffix.lower() in FOLDER_SUFFIXES and not p.name.startswith(".")]
+        files = [p for p in path.iterdir() if ending(p) in FOLDER_SUFFIXES and not p.name.startswith(".")]
         if not files:
-            others = sorted(p.name for p in path.iterdir() if p.suffix.lower() in SUFFIXES)
+            others = sorted(p.name for p in path.iterdir() if ending(p) in SUFFIXES)
             remedy = f"name the file, such as '{label}/{others[0]}'" if others else "is it the right folder?"
             raise InputError(f"expected images ({' '.join(FOLDER_SUFFIXES)}), got none; {remedy}", field=label)
     elif path.is_file():
         return [path]
     elif re.search(r"[*?]", str(path)):
-        matches = (Path(p) for p in glob.glob(str(path).replace("[", "[[]"), recursive=True))
-        files = [p for p in matches if p.suffix.lower() in SUFFIXES and p.is_file()]
+        # *.tif is also *.TIF, as on Windows
+        classes = [f"[{c}{c.upper()}]" if c.isalpha() else c for c in ending(path)]
+        pattern = str(path.with_suffix("")).replace("[", "[[]") + "".join(classes)
+        matches = (Path(p) for p in glob.glob(pattern, recursive=True))
+        files = [p for p in matches if ending(p) in SUFFIXES and p.is_file()]
         if not files:
             raise InputError(f"expected files of this pattern, got none{_nearest(path, base)}", field=label)
     else:

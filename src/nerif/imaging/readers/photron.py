@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from nerif.common.conventions import InputError
+from nerif.common.files import ending
 from nerif.imaging.readers.frames import Frames
 
 __all__ = ["PhotronFrames"]
@@ -33,7 +34,7 @@ class PhotronFrames(Frames):
     """A Photron recording, of which every n-th frame was saved (Save Step n); the time of frame i is i n / rate."""
 
     def __init__(self, path: Path, name: str) -> None:
-        is_data = path.suffix.lower() == ".mraw"
+        is_data = ending(path) == ".mraw"
         header_path = _partner(path, name, (".cihx", ".cih")) if is_data else path
         self._path = path if is_data else _partner(path, name, (".mraw",))
         self._name = Path(name).with_name(self._path.name).as_posix()
@@ -84,10 +85,11 @@ def unpack12(data: np.ndarray) -> np.ndarray:
 
 
 def _partner(path: Path, name: str, suffixes: tuple[str, ...]) -> Path:
-    """Return the file of the same name with one of these suffixes, in small or capital letters."""
+    """Return the file of the same name with one of these suffixes; small and capital letters are the same."""
+    others = sorted(path.parent.iterdir(), key=lambda other: other.stem != path.stem)
     for suffix in suffixes:
-        for other in sorted(path.parent.iterdir()):
-            if other.stem == path.stem and other.suffix.lower() == suffix:
+        for other in others:
+            if other.stem.lower() == path.stem.lower() and ending(other) == suffix:
                 return other
     raise InputError(f"expected a {' or '.join(suffixes)} file of the same name beside it, got none", field=name)
 
@@ -96,7 +98,7 @@ def _header(path: Path, name: str) -> dict[str, str]:
     """Return the entries of a header by the keys of a .cih."""
     try:
         text = path.read_bytes().decode("utf-8", errors="ignore")
-        cih = _from_xml(text) if path.suffix.lower() == ".cihx" else _from_lines(text)
+        cih = _from_xml(text) if ending(path) == ".cihx" else _from_lines(text)
         positive = min(float(cih[key]) for key in NUMBERS) > 0
         float(cih.get("Save Step") or 1)
         kind, stored = cih["File Format"], int(cih["Color Bit"])
