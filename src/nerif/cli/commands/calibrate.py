@@ -34,7 +34,7 @@ class Calibrate(Settings):
 
     SOURCE is a folder of views: VIEW/target/*.tif (target in free space, the same number for the same pose in all
     views) and VIEW/background/*.tif (target on the background of the view), or with a views.toml; or a calibration of
-    another program (.mat, .yml, .xml, transforms.json, .csv, .toml). --check only draws the rig.
+    another program (.mat, .yml, .xml, transforms.json, .npz, .csv, .toml). --check only draws the rig.
 
     With --simple, SOURCE is a folder with one view (VIEW/reference) or an image; the camera, which looks across the
     axis of a flow, follows from --distance, --background-distance and --mm-per-px.

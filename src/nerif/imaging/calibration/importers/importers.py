@@ -21,6 +21,7 @@ from nerif.common.settings import Positive, check_settings
 from nerif.geometry import Box, Lens, Plane
 from nerif.geometry.camera import POWERS
 from nerif.imaging.calibration.cameras_file import CalibratedCamera, check_camera, check_names, read_box
+from nerif.imaging.calibration.importers.geometry_files import read_geometry
 from nerif.imaging.calibration.importers.matlab import read_matlab
 from nerif.imaging.calibration.importers.nerfstudio import read_transforms
 from nerif.imaging.calibration.importers.tables import read_csv, read_tables
@@ -31,7 +32,7 @@ from nerif.imaging.readers.views import VIEWS
 __all__ = ["ImportSettings", "import_box", "import_cameras", "is_calibration"]
 
 READERS = {".toml": read_tables, ".csv": read_csv, ".json": read_transforms}
-ENDINGS = (*READERS, *YAML, ".mat")
+ENDINGS = (*READERS, *YAML, ".mat", ".npz")
 
 
 @dataclass(frozen=True)
@@ -100,7 +101,7 @@ def import_cameras(
 
     Parameters
     ----------
-    path : .toml, .csv, .yml, .yaml, .xml (OpenCV, ROS, kalibr), .json (NeRF), .mat (MATLAB)
+    path : .toml, .csv, .yml, .yaml, .xml (OpenCV, ROS, kalibr), .json (NeRF), .mat (MATLAB), .npz (ASTRA, TIGRE)
     only : names of the cameras to read; all if empty
     say : called with lines about what was read
     """
@@ -112,6 +113,8 @@ def import_cameras(
         cameras, unit = read_yaml_files(path, say)
     elif ending(path) == ".mat":
         cameras = read_matlab(path, settings.pose)
+    elif ending(path) == ".npz":
+        cameras = read_geometry(path, say)
     elif ending(path) in READERS:
         cameras = READERS[ending(path)](path)
     else:
