@@ -209,7 +209,7 @@ def test_normals_and_offsets_of_backgrounds(full):
     assert Measurement.from_dataset(dataset).cameras[0].background is None
 
 
-@pytest.mark.parametrize("value", [float("nan"), float("inf"), 0, 1e300])
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), 0, 1e300, 20.5])
 def test_invalid_image_size(full, value):
     dataset = full.to_dataset()
     dataset["image_size"] = dataset["image_size"].astype(float)

@@ -270,6 +270,43 @@ def test_csv(tmp_path, delimiter):
         refuse(path, words)
 
 
+SPREADSHEETS = {
+    "Excel, German": (";", ",", "cp1252"), "Excel, Unicode text": ("\t", ",", "utf-16"), "Calc": ("\t", ".", "utf-8"),
+    "Excel, English": (",", ".", "utf-8-sig"), "with its separator": ("sep", ",", "utf-8"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("program", SPREADSHEETS)
+def test_csv_of_spreadsheets(tmp_path, program):
+    """Decimal commas, tabs, UTF-16 and Windows-1252, capital letters, empty columns and rows."""
+    (separator, comma, encoding), path = SPREADSHEETS[program], tmp_path / "Kameras.CSV"
+    first = ["# Maße in mm"] if separator != "sep" else ["sep=|"]
+    delimiter = separator.replace("sep", "|")
+    rows = [[*map(str, row_of(c).values()), ""] for c in (ONE, TWO)]
+    cells = [[row[0], *(cell.replace(".", comma) for cell in row[1:])] for row in rows]
+    table = [[*(name.upper() for name in row_of(ONE)), ""], *cells, [""] * len(rows[0])]
+    path.write_bytes("\r\n".join([*first, *map(delimiter.join, table)]).encode(encoding))
+    got = import_cameras(path)
+    assert same(got, ONE, TWO)
+    assert [(c.name, c.image_size) for c in got] == [("one", (160, 200)), ("two", (160, 200))]
+
+
+@pytest.mark.parametrize(
+    ("delimiter", "change", "words"),
+    [
+        (",", {"fx": '"1500,5"'}, "commas in quotes"),
+        (",", {"fx": "1500,5"}, "line 2: expected 28 columns, got 29; separate them by semicolons"),
+        (";", {"fx": "1.500,5"}, "got commas and points"),
+        (";", {"width": "640.5"}, "image_size: expected height and width, whole numbers"),
+        (";", {"FX": "3"}, "expected each column once, got 'fx' twice"),
+    ],
+)
+def test_csv_numbers_that_are_ambiguous(tmp_path, delimiter, change, words):
+    path, row = tmp_path / "c.csv", {**row_of(ONE), **change}
+    path.write_text(delimiter.join(row) + "\n" + delimiter.join(map(str, row.values())) + "\n")
+    refuse(path, words)
+
+
 def test_telecentric_cameras_of_tables(tmp_path):
     """In units of the file: px per unit, and distortion of lengths in it."""
     ten = PARALLEL.intrinsics * torch.tensor([[10.0], [10.0], [1.0]], dtype=torch.float64)

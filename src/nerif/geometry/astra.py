@@ -26,7 +26,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerif.common.conventions import InputError
+from nerif.common.conventions import InputError, whole
 from nerif.geometry.camera import PERSPECTIVE, TELECENTRIC, Camera, Projection
 from nerif.geometry.grid import Box, Grid
 
@@ -144,4 +144,5 @@ def from_astra(geometry: Mapping[str, Any]) -> tuple[str, Float[Tensor, "view 12
     rows = torch.as_tensor(np.asarray(geometry["Vectors"], dtype=np.float64))
     if rows.ndim != 2 or rows.shape[1] != 12:
         raise InputError(f"expected (views, 12) numbers, got {tuple(rows.shape)}", field="Vectors")
-    return str(geometry["type"]), rows, (int(geometry["DetectorRowCount"]), int(geometry["DetectorColCount"]))
+    height, width = (whole(geometry[key], key) for key in ("DetectorRowCount", "DetectorColCount"))
+    return str(geometry["type"]), rows, (height, width)

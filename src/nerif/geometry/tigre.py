@@ -26,7 +26,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerif.common.conventions import InputError, Matrix3
+from nerif.common.conventions import InputError, Matrix3, whole
 from nerif.geometry.astra import check_vectors, depth_behind, vectors_of
 from nerif.geometry.camera import PERSPECTIVE, Camera
 from nerif.geometry.grid import Grid
@@ -145,7 +145,7 @@ def from_tigre(geometry: Mapping[str, Any]) -> tuple[Float[Tensor, "view 12"], t
         from_origin = frame[:, 0] * source[i, 0]
         parts = [origin[i] + from_origin, origin[i] + frame @ middle, du * turn[:, 1], dv * turn[:, 2]]
         vectors.append(torch.cat(parts))
-    return torch.stack(vectors), (int(rows), int(columns))
+    return torch.stack(vectors), (whole(rows, "nDetector"), whole(columns, "nDetector"))
 
 
 def _x(angle: float) -> Matrix3:

@@ -14,7 +14,7 @@ from nerif.imaging.readers.frames import Frames
 __all__ = ["PhotronFrames"]
 
 NUMBERS = ("Color Bit", "EffectiveBit Depth", "Total Frame", "Image Height", "Image Width", "Record Rate(fps)")
-"""Positive numbers that a .cih header must have."""
+"""Positive numbers that a .cih header must have, whole ones except the rate."""
 
 TAGS = {
     "Color Bit": "imageDataInfo/colorInfo/bit",
@@ -101,6 +101,8 @@ def _header(path: Path, name: str) -> dict[str, str]:
         cih = _from_xml(text) if ending(path) == ".cihx" else _from_lines(text)
         positive = min(float(cih[key]) for key in NUMBERS) > 0
         float(cih.get("Save Step") or 1)
+        for key in NUMBERS[:-1]:
+            int(cih[key])
         kind, stored = cih["File Format"], int(cih["Color Bit"])
     except (KeyError, ValueError, ElementTree.ParseError) as error:
         reason = f"no {error}" if isinstance(error, KeyError) else str(error)
