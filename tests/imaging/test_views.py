@@ -199,3 +199,13 @@ def test_two_entries_that_differ_in_case_or_ending_are_refused(folder, second):
     with refused(folder) as error:
         find_views(folder)
     assert "got both" in str(error.value)
+
+
+def test_paths_of_windows_in_views_toml(folder):
+    (folder / "views.toml").write_text("[views.a]\nreference = 'cam2\\reference\\*.tif'\nflow = 'cam2\\flow.tif[:1]'\n")
+    (view,) = find_views(folder)
+    assert (len(view.open("reference")), len(view.open("flow"))) == (3, 1)
+    for path in ("'C:\\data\\flow'", '"cam2\\flow.tif"'):  # the second one has a form feed
+        (folder / "views.toml").write_text(f"[views.a]\nflow = {path}\n")
+        with refused(f"{folder / 'views.toml'}: flow of view 'a'"):
+            find_views(folder)

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from nerif.common.conventions import InputError
-from nerif.common.files import ending
+from nerif.common.files import ending, local_path
 from nerif.imaging.readers.array_files import ArrayFrames, Hdf5Frames
 from nerif.imaging.readers.frames import Frames, SelectedFrames, size_in_words
 from nerif.imaging.readers.image_files import FileFrames
@@ -39,10 +39,12 @@ def open_frames(spec: str | Path, base: Path | None = None) -> Frames:
         each optionally followed by a selection in the syntax of Python: ``rec.cihx[0:50]``, ``rec.cihx[7]``,
         ``stack.tif[::2]``. HDF5 and .npz files may name a dataset: ``file.h5:/path/to/dataset``. Square brackets
         elsewhere are literal; classes such as ``ref_[ab].tif`` are not patterns.
+        Relative paths may be written as on Windows.
     base : folder of a relative spec, omitted from the names in messages
     """
-    text, selection, dataset = str(spec), "", ""
+    selection, dataset = "", ""
     root = Path() if base is None else Path(base)
+    text = str(local_path(spec, root, "images"))
     if (match := SELECTION.fullmatch(text)) and not (root / text).exists():
         text, selection = match.groups()
     if (match := DATASET.fullmatch(text)) and not (root / text).exists():

@@ -29,7 +29,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from nerif.common.conventions import InputError
-from nerif.common.files import check_known, ending, read_toml, write_toml
+from nerif.common.files import check_known, ending, local_path, read_toml, write_toml
 from nerif.imaging.readers.crop import Crop
 from nerif.imaging.readers.exposure import check_exposure, full_scale
 from nerif.imaging.readers.frames import Frames, read_each, size_in_words
@@ -181,7 +181,11 @@ def _from_file(file: Path) -> list[View]:
             if not isinstance(value, kind) or isinstance(value, bool):
                 raise InputError(f"'{key}' of view '{name}': expected {kind.__name__}, got {value!r}", field=file)
         crop = {k: v for k, v in entries.items() if k in CROP}
-        sources = {k: v for k, v in entries.items() if k in SOURCES}
+        sources = {
+            k: str(local_path(v, file.parent, f"{file}: {k} of view '{name}'"))
+            for k, v in entries.items()
+            if k in SOURCES
+        }
         views.append(View(name, file.parent, sources, Crop(**crop) if crop else None))
     return views
 

@@ -48,7 +48,8 @@ def read_kalibr(
             "cameras together",
             field=path,
         )
-    pose, cameras = np.eye(4), []
+    pose = np.eye(4)
+    cameras: list[CalibratedCamera] = []
     for name in chain:
         where, entries = f"{path}: {name}", values[name]
         for key in ("camera_model", "intrinsics", "distortion_coeffs", *(["T_cn_cnm1"] if cameras else [])):
