@@ -482,6 +482,9 @@ def test_the_two_files_of_opencvs_stereo_calib(tmp_path, ending):
     (tmp_path / "settings.yml").unlink()
     assert is_calibration(tmp_path)
     assert is_pair(import_cameras(tmp_path), points)
+    words = [str(first), "--image-size", "160", "200", "-o", str(tmp_path / "c.toml")]
+    calibrate.main(words)  # draws the rig, whose first camera stands in the origin
+    assert is_pair(read_cameras(tmp_path / "c.toml"), points)
     third = second.rename(second.with_name(f"pair{ending}"))  # found by its content
     assert is_pair(import_cameras(first), points)
     (tmp_path / f"old{ending}").write_bytes(third.read_bytes())
