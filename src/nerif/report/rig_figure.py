@@ -33,7 +33,8 @@ def draw_rig(axes: Axes3D, cameras: Sequence[Camera], box: Box | None = None) ->
 
     corners = [image_corners(c, np.zeros(3) if box is None else np.array(box.centre)) for c in cameras]
     centres = np.stack([c.start.mean(axis=0) for c in corners])
-    extent = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max()) or float(np.linalg.norm(centres[0])) or 1.0
+    spread = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
+    extent = spread or float(np.linalg.norm(centres[0])) or 1.0
     points = [centres]
     rank = np.argsort(np.argsort(np.arctan2(*(centres - centres.mean(axis=0)).T[1::-1])))
     for i, (camera, corner, centre) in enumerate(zip(cameras, corners, centres, strict=True)):
