@@ -8,6 +8,7 @@ from .analysis.prediction import predict as predict
 from .analysis.prediction import reproject as reproject
 from .common.conventions import InputError as InputError
 from .data.exports import export as export
+from .data.exports import export_geometry as export_geometry
 from .data.measurement import Measurement as Measurement
 from .data.reprojection import Reprojection as Reprojection
 from .data.volume import Volume as Volume

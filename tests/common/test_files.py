@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import os
+from pathlib import Path
+
 import pytest
 
-from nerif.common.files import atomic, check_known, read_toml, write_toml
+from nerif.common.files import atomic, check_known, local_path, read_toml, write_toml
 from refusals import refused
 
 
@@ -62,3 +65,25 @@ def test_invalid_toml(content, tmp_path):
         path.write_bytes(content)
     with refused(path):
         read_toml(path, "file; expected a calibration")
+
+
+@pytest.mark.parametrize("path", [r"C:\data\new", r"cam1\reference\*.tif", r"D:\users\x"])
+def test_backslashes_in_double_quotes_are_explained(tmp_path, path):
+    file = tmp_path / "t.toml"
+    file.write_text(f'a = "{path}"\n')
+    with refused(file) as error:
+        read_toml(file)
+    assert "write paths with /, or in single quotes" in str(error.value)
+    file.write_text(f"a = '{path}'\n")
+    assert read_toml(file) == {"a": path}
+
+
+@pytest.mark.skipif(os.name == "nt", reason="paths of Windows elsewhere")
+def test_paths_of_windows_on_another_system(tmp_path):
+    assert local_path(r"cam1\reference\*.tif", tmp_path, "x") == Path("cam1/reference/*.tif")
+    (tmp_path / r"odd\name.tif").touch()
+    assert local_path(r"odd\name.tif", tmp_path, "x") == Path(r"odd\name.tif")
+    tab_and_form_feed = ("C:\tmp\new", "run\flow")
+    for path in (r"C:\data\new", "C:/data/new", r"\\server\data", *tab_and_form_feed):
+        with refused("x"):
+            local_path(path, tmp_path, "x")

@@ -222,7 +222,7 @@ def test_normals_and_offsets_of_backgrounds(full):
     assert Measurement.from_dataset(dataset).cameras[0].background is None
 
 
-@pytest.mark.parametrize("value", [float("nan"), float("inf"), 0, 1e300])
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), 0, 1e300, 20.5])
 def test_invalid_image_size(full, value):
     dataset = full.to_dataset()
     dataset["image_size"] = dataset["image_size"].astype(float)
@@ -251,7 +251,7 @@ def test_a_truncated_file_is_refused_silently(full, tmp_path, capfd):
     content = (tmp_path / "m.nc").read_bytes()
     for share in (0.2, 0.6, 0.95):
         (tmp_path / "cut.nc").write_bytes(content[: int(share * len(content))])
-        with pytest.raises(InputError, match=r"cut.nc: not a readable NetCDF-4 file, or truncated"):
+        with pytest.raises(InputError, match=r"cut.nc: not a readable NetCDF file, or truncated"):
             Measurement.read(tmp_path / "cut.nc")
     assert capfd.readouterr().err == ""
 
@@ -266,3 +266,22 @@ def test_files_of_others_are_read(name, pose_sigma):
     assert all((camera.pose_sigma is not None) == pose_sigma for camera in m.cameras)
     assert len(m.cameras) == 9
     assert {c.lens for c in m.cameras} == {Lens(6.25) if name == "all" else Lens(window=6.0)}
+
+
+@pytest.mark.parametrize("version", ["NETCDF3_CLASSIC", "NETCDF3_64BIT"])
+def test_netcdf_3_is_read_as_version_4(full, tmp_path, version):
+    path = tmp_path / "classic.nc"
+    full.to_dataset().to_netcdf(path, engine="scipy", format=version)
+    read = Measurement.read(path)
+    assert read.names == full.names
+    assert torch.equal(read.displacement.nan_to_num(), full.displacement.nan_to_num())
+    assert torch.equal(read.valid, full.valid)
+    for a, b in zip(read.cameras, full.cameras, strict=True):
+        assert torch.equal(a.intrinsics, b.intrinsics)
+        assert a.image_size == b.image_size
+    content = path.read_bytes()
+    for damaged in (content[: len(content) // 2], content[:40], b"CDF\x05" + content[4:]):
+        path.write_bytes(damaged)
+        words = "(not a readable NetCDF file|expected NetCDF-4 .* nccopy -k 4 classic.nc)"
+        with pytest.raises(InputError, match=f"classic.nc: {words}"):
+            Measurement.read(path)

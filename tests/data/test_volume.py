@@ -48,7 +48,18 @@ def test_the_gas_is_that_of_the_run_unless_changed():
     assert GasChanges("N2").of({}) == GasSettings("N2")
 
 
-@pytest.mark.parametrize("ending", [".nc", ".vti"])
+def test_volumes_of_netcdf_3(volumes, tmp_path):
+    path, classic = tmp_path / "v.nc", tmp_path / "classic.nc"
+    write_netcdf(path, volumes)
+    with xr.open_dataset(path) as dataset:
+        dataset.to_netcdf(classic, engine="scipy", format="NETCDF3_64BIT")
+    back = read_volumes(classic)
+    for v in volumes:
+        assert torch.equal(back[v.quantity].values.nan_to_num(-1), v.values.nan_to_num(-1))
+        assert back[v.quantity].grid == v.grid
+
+
+@pytest.mark.parametrize("ending", [".nc", ".vti", ".NC", ".Vti"])
 def test_volumes_are_read_as_written(volumes, tmp_path, ending):
     path = tmp_path / f"v{ending}"
     export(path, volumes)

@@ -15,6 +15,7 @@ import pytest
 import scipy.io
 import tomli_w
 import torch
+import yaml
 from scipy.spatial.transform import Rotation
 
 from nerif.cli.commands import calibrate
@@ -277,6 +278,43 @@ def test_csv(tmp_path, delimiter):
         refuse(path, words)
 
 
+SPREADSHEETS = {
+    "Excel, German": (";", ",", "cp1252"), "Excel, Unicode text": ("\t", ",", "utf-16"), "Calc": ("\t", ".", "utf-8"),
+    "Excel, English": (",", ".", "utf-8-sig"), "with its separator": ("sep", ",", "utf-8"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("program", SPREADSHEETS)
+def test_csv_of_spreadsheets(tmp_path, program):
+    """Decimal commas, tabs, UTF-16 and Windows-1252, capital letters, empty columns and rows."""
+    (separator, comma, encoding), path = SPREADSHEETS[program], tmp_path / "Kameras.CSV"
+    first = ["# Maße in mm"] if separator != "sep" else ["sep=|"]
+    delimiter = separator.replace("sep", "|")
+    rows = [[*map(str, row_of(c).values()), ""] for c in (ONE, TWO)]
+    cells = [[row[0], *(cell.replace(".", comma) for cell in row[1:])] for row in rows]
+    table = [[*(name.upper() for name in row_of(ONE)), ""], *cells, [""] * len(rows[0])]
+    path.write_bytes("\r\n".join([*first, *map(delimiter.join, table)]).encode(encoding))
+    got = import_cameras(path)
+    assert same(got, ONE, TWO)
+    assert [(c.name, c.image_size) for c in got] == [("one", (160, 200)), ("two", (160, 200))]
+
+
+@pytest.mark.parametrize(
+    ("delimiter", "change", "words"),
+    [
+        (",", {"fx": '"1500,5"'}, "commas in quotes"),
+        (",", {"fx": "1500,5"}, "line 2: expected 28 columns, got 29; separate them by semicolons"),
+        (";", {"fx": "1.500,5"}, "got commas and points"),
+        (";", {"width": "640.5"}, "image_size: expected height and width, whole numbers"),
+        (";", {"FX": "3"}, "expected each column once, got 'fx' twice"),
+    ],
+)
+def test_csv_numbers_that_are_ambiguous(tmp_path, delimiter, change, words):
+    path, row = tmp_path / "c.csv", {**row_of(ONE), **change}
+    path.write_text(delimiter.join(row) + "\n" + delimiter.join(map(str, row.values())) + "\n")
+    refuse(path, words)
+
+
 def test_telecentric_cameras_of_tables(tmp_path):
     """In units of the file: px per unit, and distortion of lengths in it."""
     ten = PARALLEL.intrinsics * torch.tensor([[10.0], [10.0], [1.0]], dtype=torch.float64)
@@ -300,7 +338,7 @@ def test_telecentric_cameras_of_tables(tmp_path):
 BOTH = {f"{k}{i}": v for i, camera in ((1, ONE), (2, TWO)) for k, v in arrays(camera).items()}
 
 
-@pytest.mark.parametrize("suffix", [".yml", ".yaml", ".xml"])
+@pytest.mark.parametrize("suffix", [".yml", ".yaml", ".xml", ".YML"])
 @pytest.mark.parametrize("vector", [False, True])
 def test_opencv_one_camera_per_file(tmp_path, suffix, vector):
     a, path = arrays(ONE), tmp_path / f"left{suffix}"
@@ -417,9 +455,174 @@ def test_opencv_texts_that_are_none(tmp_path):
     path.write_text(path.read_text() + "K: [ [ 1, 2 ], [ 3 ] ]\n")
     refuse(path, "camera 1: intrinsics: expected 3 x 3 numbers")
     path.write_text("nothing of the kind")
-    refuse(path, "not a file written by OpenCV")
+    refuse(path, "not a file of OpenCV")
     empty.mkdir()
-    refuse(empty, "found none")
+    refuse(empty, "got none")
+
+
+def beside(camera: Camera) -> Camera:
+    """Another camera 120 mm to its right, turned a little."""
+    turn = torch.from_numpy(Rotation.from_rotvec([0.01, -0.15, 0.03]).as_matrix())
+    shift = torch.tensor([-120.0, 4.0, 7.0], dtype=torch.float64)
+    return dataclasses.replace(
+        make("right", 7), rotation=turn @ camera.rotation, translation=turn @ camera.translation + shift
+    )
+
+
+RIGHT = beside(ONE)
+
+
+def rectified(unit: float = 1.0, **more: Any) -> tuple[np.ndarray, ...]:
+    """R, T, R1, R2, P1, P2, Q of ONE and RIGHT by cv2.stereoRectify, in a unit of so many mm."""
+    a, b = arrays(ONE), arrays(RIGHT)
+    rotation = b["R"] @ a["R"].T
+    shift = (b["t"] - rotation @ a["t"])[:, None] / unit
+    result = cv2.stereoRectify(a["K"], a["D"], b["K"], b["D"], (200, 160), rotation, shift, **more)
+    return rotation, shift, *result[:5]
+
+
+def stereo_calib(folder: Path, ending: str = ".yml") -> torch.Tensor:
+    """The files of OpenCV's samples/cpp/stereo_calib.cpp for ONE and RIGHT; return the points of the world."""
+    a, b, names = arrays(ONE), arrays(RIGHT), ("R", "T", "R1", "R2", "P1", "P2", "Q")
+    write_opencv(folder / f"intrinsics{ending}", {"M1": a["K"], "D1": a["D"], "M2": b["K"], "D2": b["D"]})
+    write_opencv(folder / f"extrinsics{ending}", dict(zip(names, rectified(), strict=True)))
+    return POINTS @ ONE.rotation.T + ONE.translation
+
+
+def is_pair(cameras: Any, points: torch.Tensor) -> bool:
+    """Whether the first camera, which is the world, projects as ONE and the second as RIGHT."""
+    pixels = [camera.camera((160, 200), PLANE).project(points) for camera in cameras]
+    return all(torch.allclose(p, c.project(POINTS), atol=1e-6) for p, c in zip(pixels, (ONE, RIGHT), strict=True))
+
+
+@pytest.mark.parametrize("ending", [".yml", ".XML"])
+def test_the_two_files_of_opencvs_stereo_calib(tmp_path, ending):
+    points, first, second = stereo_calib(tmp_path, ending), *(tmp_path / f"{n}trinsics{ending}" for n in ("in", "ex"))
+    write_opencv(tmp_path / "settings.yml", {"board_width": 9})
+    for path in (first, second):
+        lines: list[str] = []
+        assert is_pair(import_cameras(path, say=lines.append), points)
+        assert lines == [f"intrinsics{ending}: read together with extrinsics{ending}"]
+    (tmp_path / "settings.yml").unlink()
+    assert is_calibration(tmp_path)
+    assert is_pair(import_cameras(tmp_path), points)
+    words = [str(first), "--image-size", "160", "200", "-o", str(tmp_path / "c.toml")]
+    calibrate.main(words)  # draws the rig, whose first camera stands in the origin
+    assert is_pair(read_cameras(tmp_path / "c.toml"), points)
+    third = second.rename(second.with_name(f"pair{ending}"))  # found by its content
+    assert is_pair(import_cameras(first), points)
+    (tmp_path / f"old{ending}").write_bytes(third.read_bytes())
+    refuse(first, f"expected that file beside it, got old{ending}, pair{ending}")
+    (tmp_path / f"old{ending}").unlink()
+    lone = first.rename(tmp_path / "lone")
+    refuse(third, "holds the pose R, T .*, but not the camera matrices M1, .* to intrinsics.yml; .* got none")
+    third.unlink()
+    refuse(lone.rename(first), "holds the camera matrices M1, .*, but not the pose R, T .* to extrinsics.yml")
+
+
+# -- ROS and kalibr ------------------------------------------------------------------------------------------------
+
+
+def camera_info(camera: Camera, rotation: np.ndarray, projection: np.ndarray, **more: Any) -> dict[str, Any]:
+    """What camera_calibration writes of a camera."""
+
+    def matrix(a: np.ndarray) -> dict[str, Any]:
+        return {"rows": a.shape[0], "cols": a.shape[1], "data": a.ravel().tolist()}
+
+    values = {"image_width": 200, "image_height": 160, "camera_name": f"stereo/{camera.name}"}
+    values |= {"camera_matrix": matrix(camera.intrinsics.numpy()), "distortion_model": "plumb_bob"}
+    values |= {"distortion_coefficients": matrix(camera.distortion.numpy()[None])}
+    return {**values, "rectification_matrix": matrix(rotation), "projection_matrix": matrix(projection), **more}
+
+
+def stereo_info(zero_disparity: bool = True, **more: Any) -> tuple[dict[str, Any], dict[str, Any], torch.Tensor]:
+    """The files of ONE and RIGHT, in m, and the points of the world in mm."""
+    _, _, r1, r2, p1, p2, _ = rectified(1000.0, flags=cv2.CALIB_ZERO_DISPARITY if zero_disparity else 0)
+    points = POINTS @ ONE.rotation.T + ONE.translation
+    return camera_info(ONE, r1, p1, **more), camera_info(RIGHT, r2, p2, **more), points
+
+
+@pytest.mark.parametrize("zero_disparity", [True, False])
+def test_a_stereo_pair_of_ros(tmp_path, zero_disparity):
+    """The pose of the second camera follows from the rectification and the baseline in m."""
+    *infos, points = stereo_info(zero_disparity)
+    left, right = (tmp_path / name for name in ("left.yaml", "right.yaml"))
+    for path, info in zip((left, right), infos, strict=True):
+        path.write_text(yaml.safe_dump(info))
+    for path in (left, right, tmp_path):
+        lines: list[str] = []
+        cameras = import_cameras(path, say=lines.append)
+        assert is_pair(cameras, points)
+        assert [(c.name, c.image_size) for c in cameras] == [("left", (160, 200)), ("right", (160, 200))]
+        assert len(lines) == (path != tmp_path)
+    half = import_cameras(left, ImportSettings(scale_mm=500.0))[1].translation
+    assert torch.allclose(half, import_cameras(left)[1].translation / 2)
+    (tmp_path / "notes.yaml").write_text("a: 3\n")
+    refuse(tmp_path, "expected files of one program, got")
+    right.unlink()
+    refuse(left, "no pose in a camera_info of ROS; .* left.yaml and right.yaml.* beside it: no other")
+    right.write_text(yaml.safe_dump(infos[0]))
+    refuse(left, "expected one camera without a shift in projection_matrix, .* got left.yaml, right.yaml without")
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"distortion_model": "equidistant"}, "undistort the images"),
+        ({"distortion_model": "rational_polynomial", "distortion_coefficients": {"data": [0.1] * 8}}, "at most 5"),
+        ({"rectification_matrix": {"data": [1.0, 0.0]}}, "rectification_matrix: expected 3 x 3 numbers, got 2"),
+        ({"projection_matrix": None}, "projection_matrix: expected 3 x 4 numbers, got 0"),
+        ({"image_height": 160.5}, "whole numbers of px"),
+    ],
+)
+def test_errors_in_files_of_ros(tmp_path, change, words):
+    for name, info in zip(("left.yaml", "right.yaml"), stereo_info(**change)[:2], strict=True):
+        (tmp_path / name).write_text(yaml.safe_dump(info))
+    refuse(tmp_path, words)
+
+
+def camchain(*cameras: Camera, **more: Any) -> dict[str, Any]:
+    """kalibr's chain of cameras: each pose is relative to the camera before, in m."""
+    chain: dict[str, Any] = {}
+    before = np.eye(4)
+    for i, camera in enumerate(cameras):
+        k, pose = camera.intrinsics.numpy(), np.eye(4)
+        pose[:3, :3], pose[:3, 3] = camera.rotation.numpy(), camera.translation.numpy() / 1000
+        relative = {"T_cn_cnm1": (pose @ np.linalg.inv(before)).tolist()} if i else {}
+        chain[f"cam{i}"] = {
+            "camera_model": "pinhole", "intrinsics": k[[0, 1, 0, 1], [0, 1, 2, 2]].tolist(), "resolution": [200, 160],
+            "distortion_model": "radtan", "distortion_coeffs": camera.distortion[:4].tolist(), "cam_overlaps": [1],
+            "rostopic": f"/cam{i}/image_raw", **relative, **more,
+        }  # fmt: skip
+        before = pose
+    return chain
+
+
+def test_kalibrs_chain_of_cameras(tmp_path):
+    """Block sequences and numbers such as 1e-05, which YAML 1.1 reads as texts."""
+    path = tmp_path / "camchain.yaml"
+    scale = torch.tensor([1, 1, 1e-3, 1, 0], dtype=torch.float64)
+    cameras = [dataclasses.replace(c, distortion=c.distortion * scale) for c in (ONE, TWO, make("three", 3))]
+    path.write_text(yaml.safe_dump(camchain(*cameras)).replace("1.0e-06", "1e-06"))
+    assert "- 1e-06" in path.read_text()
+    got = import_cameras(path)
+    assert [(c.name, c.image_size) for c in got] == [(f"cam{i}", (160, 200)) for i in range(3)]
+    world = POINTS @ ONE.rotation.T + ONE.translation
+    for camera, expected in zip(got, cameras, strict=True):
+        assert torch.allclose(camera.camera(background=PLANE).project(world), expected.project(POINTS), atol=1e-6)
+    path.write_text(yaml.safe_dump(camchain(ONE)))
+    refuse(path, "no pose; expected the chain of two cameras or more")
+    for change, words in (
+        ({"distortion_model": "equidistant"}, "cam0: distortion_model: .* undistort the images"),
+        ({"camera_model": "omni"}, "cam0: camera_model: .* undistort the images"),
+        ({"intrinsics": [1, 2, 3]}, "cam0: intrinsics: expected 4 numbers"),
+    ):
+        path.write_text(yaml.safe_dump(camchain(ONE, TWO, **change)))
+        refuse(path, words)
+    chain = camchain(ONE, TWO)
+    del chain["cam1"]["T_cn_cnm1"]
+    path.write_text(yaml.safe_dump(chain))
+    refuse(path, "cam1: 'T_cn_cnm1' is missing")
 
 
 def test_opencv_cameras_of_browns_model_are_read(tmp_path):

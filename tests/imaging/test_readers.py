@@ -258,7 +258,7 @@ def test_truncated_photron_file(tmp_path, stack12):
     np.testing.assert_array_equal(frames[1], stack12[1])
 
 
-@pytest.mark.parametrize("change", [{"bit": 36}, {"kind": "Tiff"}, {"n": 0}, {"h": "none"}])
+@pytest.mark.parametrize("change", [{"bit": 36}, {"kind": "Tiff"}, {"n": 0}, {"h": "none"}, {"w": 640.5}])
 def test_invalid_photron_header(tmp_path, change):
     write_photron(tmp_path, b"", **change)
     with refused("rec.cih"):

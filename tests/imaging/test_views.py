@@ -186,3 +186,36 @@ def test_images_without_a_target_are_reported(folder, lines):
     images = find_targets(find_views(folder)[0], target, lines.append, lambda: calls.append(1))
     assert (images.poses, images.size, len(calls)) == ({}, (120, 160), 2)
     assert sum("no charuco of 8 x 6 found" in line for line in lines) == 2
+
+
+def test_capital_letters_of_folders_endings_and_the_list_of_views(folder):
+    (folder / "cam2" / "reference").rename(folder / "cam2" / "REFERENCE")
+    (folder / "cam2" / "flow.tif").rename(folder / "cam2" / "Flow.TIF")
+    (folder / "cam2" / "flow.txt").write_text("notes")
+    view = find_views(folder)[0]
+    assert (len(view.open("reference")), len(view.open("flow"))) == (3, 1)
+    (folder / "cam2" / "REFERENCE" / "r1.tif").rename(folder / "cam2" / "REFERENCE" / "r1.TIF")
+    assert len(open_frames("cam2/REFERENCE/r*.tif", folder)) == 3
+    (folder / "Views.TOML").write_text('[views.a]\nreference = "cam10/reference"\n')
+    assert [v.name for v in find_views(folder)] == ["a"]
+    write_crops(folder, {"a": Crop(row=1)})
+    assert find_views(folder)[0].crop == Crop(row=1)
+    assert not (folder / "views.toml").exists()
+
+
+@pytest.mark.parametrize("second", ["cam2/Flow.png", "cam2/flow/f.tif", "cam2/FLOW.TIF", "CAM2/flow.tif"])
+def test_two_entries_that_differ_in_case_or_ending_are_refused(folder, second):
+    save(folder / second, np.zeros(SHAPE, np.uint8))
+    with refused(folder) as error:
+        find_views(folder)
+    assert "got both" in str(error.value)
+
+
+def test_paths_of_windows_in_views_toml(folder):
+    (folder / "views.toml").write_text("[views.a]\nreference = 'cam2\\reference\\*.tif'\nflow = 'cam2\\flow.tif[:1]'\n")
+    (view,) = find_views(folder)
+    assert (len(view.open("reference")), len(view.open("flow"))) == (3, 1)
+    for path in ("'C:\\data\\flow'", '"cam2\\flow.tif"'):  # the second one has a form feed
+        (folder / "views.toml").write_text(f"[views.a]\nflow = {path}\n")
+        with refused(f"{folder / 'views.toml'}: flow of view 'a'"):
+            find_views(folder)

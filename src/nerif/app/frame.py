@@ -16,6 +16,7 @@ from nerif.app.elements import dialog, refusals, text_html
 from nerif.app.jobs import REFUSED, Job
 from nerif.app.result_volumes import film_progress
 from nerif.app.workspace import READ_ONLY, Workspace
+from nerif.common.files import ending
 from nerif.results.live import read_live
 
 __all__ = ["JobsDrawer", "Page", "frame"]
@@ -192,7 +193,7 @@ class JobsDrawer:
 
 def _progress(work: Workspace, job: Job) -> tuple[float, str]:
     """Return the progress of a run, 0 to 1, and its stage; 0 and an empty text if unavailable."""
-    if job.out.endswith(".zarr") and job.state in ("running", "paused"):
+    if ending(job.out) == ".zarr" and job.state in ("running", "paused"):
         return film_progress(work.project.path(job.out))
     live = read_live(work.project.path(job.out)) if job.out and job.state in ("running", "paused") else {}
     if not live or live["written"] < job.started:

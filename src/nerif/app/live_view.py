@@ -16,6 +16,7 @@ from nerif.app.result_volumes import film_progress
 from nerif.app.surfaces import LiveSurface, caption_of
 from nerif.app.workspace import Workspace
 from nerif.common.conventions import unit_shown
+from nerif.common.files import ending
 from nerif.data.volume import name_of
 from nerif.geometry import Box
 from nerif.plotting.drawing import colour_range, map_range
@@ -85,7 +86,7 @@ class LiveView:
 
     async def _show(self, job: Job) -> None:
         out = self.work.project.path(job.out)
-        if out.suffix == ".zarr":
+        if ending(out) == ".zarr":
             share, title = await self.work.in_thread(film_progress, out)
             self.status.set_content(status_html(job, {}, title))
             self.bar.set_value(share)

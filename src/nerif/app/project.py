@@ -10,6 +10,7 @@ from typing import TypeVar
 
 from nerif.cli.commands.info import is_measurement
 from nerif.common.conventions import InputError
+from nerif.common.files import ending
 from nerif.imaging.readers.views import View, find_views
 from nerif.results.directory import LIVE, RUN
 
@@ -134,7 +135,7 @@ class Project:
             path = Path(entry.path)
             if not entry.is_dir(follow_symlinks=False):
                 yield path
-            elif path.suffix == ".zarr" or _is_result(path):
+            elif ending(path) == ".zarr" or _is_result(path):
                 yield path
                 yield from (p for p in (path / "measurement.nc",) if p.is_file())
             elif depth:
@@ -143,16 +144,16 @@ class Project:
     def _kind(self, path: Path) -> str:
         """Name of the field of Contents that a path belongs to, empty if none."""
         if path.is_dir():
-            if path.suffix == ".zarr":
+            if ending(path) == ".zarr":
                 return "films"
             return "results" if _is_result(path) else "experiments" if _has_views(path) else ""
-        if path.suffix == ".toml":
+        if ending(path) == ".toml":
             return "calibrations" if self.from_cache(self.relative(path), "kind", _is_calibration) else ""
-        if path.suffix == ".nc" and path.name != "reprojection.nc":
+        if ending(path) == ".nc" and path.name != "reprojection.nc":
             measured = self.from_cache(self.relative(path), "kind", is_measurement)
             if measured:
                 return "measurements"
-        return "volumes" if path.suffix in (".nc", ".vti") and not _is_result(path.parent) else ""
+        return "volumes" if ending(path) in (".nc", ".vti") and not _is_result(path.parent) else ""
 
 
 def _is_result(path: Path) -> bool:

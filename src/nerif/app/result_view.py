@@ -19,6 +19,7 @@ from nerif.app.sliders import RangeSlider
 from nerif.app.surfaces import Surface, SurfaceView
 from nerif.app.workspace import Workspace
 from nerif.common.conventions import InputError, unit_shown
+from nerif.common.files import ending
 from nerif.data.volume import Volume, describe
 from nerif.plotting.drawing import DIVERGING, LABELS, map_range
 from nerif.report.slice_images import colours_of
@@ -203,7 +204,7 @@ class ResultView:
 
     def _surface_of(self, name: str, frame: int) -> Surface:
         path = self.work.project.path(name)
-        file = path / ("zarr.json" if path.suffix == ".zarr" else VOLUME)
+        file = path / ("zarr.json" if ending(path) == ".zarr" else VOLUME)
         return Surface(name, frame, file.stat().st_mtime_ns if file.is_file() else 0)
 
 

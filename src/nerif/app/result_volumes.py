@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Protocol
 
 from nerif.common.conventions import STATISTICS, InputError
+from nerif.common.files import ending
 from nerif.data.volume import INDEX, Volume
 from nerif.data.volume_file import read_volumes
 from nerif.data.volume_sequence import VolumeSequence
@@ -101,7 +102,7 @@ class Film:
 
 def source_of(path: Path) -> Source:
     """Open a result directory or a store over time."""
-    return Film(path) if path.suffix == ".zarr" else Still(path)
+    return Film(path) if ending(path) == ".zarr" else Still(path)
 
 
 def film_progress(path: Path) -> tuple[float, str]:

@@ -15,6 +15,7 @@ from starlette.responses import FileResponse, PlainTextResponse, Response
 from nerif.app.result_volumes import source_of
 from nerif.app.workspace import Workspace
 from nerif.common.conventions import InputError
+from nerif.common.files import ending
 from nerif.data.volume import Volume
 from nerif.report.isosurface import default_level, stl_of, surface_triangles
 from nerif.results.directory import REPORT
@@ -34,7 +35,7 @@ Handler = Callable[[Request], Awaitable[Response]]
 
 def report_file(path: Path) -> Path:
     """Return the path of the report of a result directory or of a store over time."""
-    return path.with_suffix(".html") if path.suffix == ".zarr" else path / REPORT
+    return path.with_suffix(".html") if ending(path) == ".zarr" else path / REPORT
 
 
 def report_address(name: str, stamp: int) -> str:

@@ -5,6 +5,7 @@ Lengths are millimetres, image quantities pixels, angles radians, times seconds.
 
 from __future__ import annotations
 
+import math
 from typing import SupportsFloat
 
 from jaxtyping import Bool, Float
@@ -28,6 +29,7 @@ __all__ = [
     "ambient_index",
     "parse_faces",
     "unit_shown",
+    "whole",
     "with_unit",
 ]
 
@@ -90,6 +92,17 @@ def ambient_index(value: object, name: str = "n_ambient") -> float:
     if not isinstance(value, SupportsFloat) or not 0.9 < float(value) < LARGEST_INDEX:
         raise InputError(f"expected a refractive index such as 1.00027, got {value}", field=name)
     return float(value)
+
+
+def whole(value: object, name: str) -> int:
+    """Return a whole number of a file as an int."""
+    try:
+        number = float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError):
+        number = math.nan
+    if not number.is_integer():
+        raise InputError(f"expected a whole number, got {value}", field=name)
+    return int(number)
 
 
 def unit_shown(unit: str) -> str:

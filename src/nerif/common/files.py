@@ -6,6 +6,7 @@ import difflib
 import json
 import math
 import os
+import re
 import shutil
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping
@@ -15,10 +16,37 @@ from typing import Any
 
 from nerif.common.conventions import InputError
 
-__all__ = ["atomic", "check_known", "read_toml", "write_json", "write_toml", "written"]
+__all__ = ["atomic", "check_known", "ending", "local_path", "read_toml", "write_json", "write_toml", "written"]
+
+CONTROL = re.compile(r"[\x00-\x1f]")
+"""Characters of no path: \\t, \\n and others that TOML makes of C:\\tmp\\new in double quotes."""
+DRIVE = re.compile(r"[A-Za-z]:[\\/]|\\\\")
+"""Beginning of an absolute path of Windows."""
+ESCAPES = "in double quotes a backslash begins an escape: write paths with /, or in single quotes"
 
 written: list[Path] = []
 """Paths that this process has written, in order."""
+
+
+def ending(path: str | os.PathLike[str]) -> str:
+    """Return the ending of a file name in small letters, such as ".nc": cameras and copies may write .NC."""
+    return Path(path).suffix.lower()
+
+
+def local_path(path: str | os.PathLike[str], base: Path, field: object) -> Path:
+    """Return a path, relative to `base`, as this system writes it: a relative path of Windows holds everywhere."""
+    text = os.fspath(path)
+    if bad := CONTROL.search(text):
+        raise InputError(f"expected a path, got {text!r} with {bad[0]!r} in it; {ESCAPES}", field=field)
+    if os.name == "nt" or ("\\" not in text and not DRIVE.match(text)) or (base / text).exists():
+        return Path(text)
+    if DRIVE.match(text):
+        raise InputError(
+            f"expected a path of this system, got '{text}' of Windows; give a relative one, such as "
+            "cam1/reference, or where the files are on this system",
+            field=field,
+        )
+    return Path(text.replace("\\", "/"))
 
 
 @contextmanager
@@ -55,7 +83,8 @@ def read_toml(path: str | os.PathLike[str], expected: str = "TOML file") -> dict
     except FileNotFoundError:
         raise InputError(f"no such {expected}", field=path) from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, IsADirectoryError) as error:
-        raise InputError(f"not a TOML file ({error})", field=path) from None
+        remedy = f"; {ESCAPES}" if str(error).startswith(("Unescaped", "Invalid hex value")) else ""
+        raise InputError(f"not a TOML file ({error}){remedy}", field=path) from None
 
 
 def write_toml(path: str | os.PathLike[str], table: Mapping[str, Any], head: str = "") -> None:

@@ -1,4 +1,8 @@
-"""NetCDF-4 files and Zarr stores, opened lazily, with an InputError where they are damaged."""
+"""NetCDF files and Zarr stores, opened lazily, with an InputError where they are damaged.
+
+NetCDF-4 is HDF5. The classic formats of version 3 begin with CDF and a number: 1 classic, 2 with 64-bit offsets, which
+SciPy reads, and 5 with 64-bit data, which it does not.
+"""
 
 from __future__ import annotations
 
@@ -16,6 +20,8 @@ from nerif.common.conventions import InputError
 if TYPE_CHECKING:
     import xarray as xr
 
+CLASSIC, WIDE = (b"CDF\x01", b"CDF\x02"), b"CDF\x05"
+"""First bytes of NetCDF-3 files."""
 HEAP = b"GCOL\x01\0\0\0"
 """Signature and version of a global heap of HDF5."""
 
@@ -30,22 +36,33 @@ def opened(path: str | os.PathLike[str], expected: str) -> Iterator[xr.Dataset]:
     ----------
     expected : content of the file, such as "a measurement"
     """
-    import h5py
-    import xarray as xr
-
     path = Path(path)
     if not path.is_file():
         raise InputError(f"no such file; expected {expected}", field=path)
-    with reading(f"{path}: not a readable NetCDF-4 file, or truncated"):
-        check_heaps(path)
-        with h5py.File(path, "r") as file:
-            file.attrs.get("_nc3_strict")  # where this fails, h5netcdf leaves a half-made object that complains later
-        dataset = xr.open_dataset(path, engine="h5netcdf", decode_times=False)
+    with reading(f"{path}: not a readable NetCDF file, or truncated"):
+        dataset = _dataset(path)
     with dataset:
         try:
             yield dataset
         except InputError as error:
             raise error.inside(path) from None
+
+
+def _dataset(path: Path) -> xr.Dataset:
+    import h5py
+    import xarray as xr
+
+    with path.open("rb") as content:
+        first = content.read(4)
+    if first in CLASSIC:  # read whole: a map of memory could not be closed while arrays refer to it
+        return xr.open_dataset(path, engine="scipy", decode_times=False, mmap=False)
+    if first == WIDE:
+        remedy = f"nccopy -k 4 {path.name} {path.stem}4.nc"
+        raise InputError(f"expected NetCDF-4 or classic, got NetCDF-3 with 64-bit data; convert: {remedy}", field=path)
+    check_heaps(path)
+    with h5py.File(path, "r") as file:
+        file.attrs.get("_nc3_strict")  # where this fails, h5netcdf leaves a half-made object that complains later
+    return xr.open_dataset(path, engine="h5netcdf", decode_times=False)
 
 
 def values(variable: xr.DataArray) -> np.ndarray:

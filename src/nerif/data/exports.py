@@ -1,30 +1,39 @@
-"""Exports: VTK (.vti for ParaView), NetCDF (.nc), NumPy (.npz), MATLAB (.mat), text (.csv)."""
+"""Exports: volumes in VTK (.vti for ParaView), NetCDF (.nc), NumPy (.npz), MATLAB (.mat), text (.csv); the geometry of
+cameras and grid for ASTRA and TIGRE (.npz).
+"""
 
 from __future__ import annotations
 
 import json
 import os
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from nerif.common.conventions import InputError
-from nerif.common.files import atomic
+from nerif.common.files import atomic, ending
+from nerif.data.measurement import Measurement
 from nerif.data.volume import Volume
 from nerif.data.volume_file import write_netcdf
 from nerif.data.vti import write_vti
+from nerif.geometry import Grid
+from nerif.geometry.astra import astra_of
+from nerif.geometry.tigre import tigre_of
 
-__all__ = ["FORMATS", "export", "write_csv", "write_mat", "write_npz"]
+__all__ = ["FORMATS", "PROGRAMS", "export", "export_geometry", "write_csv", "write_mat", "write_npz"]
+
+PROGRAMS = ("astra", "tigre")
+"""Programs for whose geometry there is an export."""
 
 
 def export(path: str | os.PathLike[str], volumes: list[Volume]) -> None:
     """Write volumes on one grid in the format of the ending of `path`, one of FORMATS."""
-    suffix = Path(path).suffix
-    if suffix not in FORMATS:
-        raise InputError(f"expected a name ending in {', '.join(FORMATS)}, got '{suffix}'", field=path)
-    FORMATS[suffix](path, volumes)
+    if ending(path) not in FORMATS:
+        raise InputError(f"expected a name ending in {', '.join(FORMATS)}, got '{Path(path).suffix}'", field=path)
+    FORMATS[ending(path)](path, volumes)
 
 
 def _write_vti(path: str | os.PathLike[str], volumes: list[Volume]) -> None:
@@ -78,3 +87,32 @@ def write_csv(path: str | os.PathLike[str], volumes: list[Volume]) -> None:
 
 
 FORMATS = {".vti": _write_vti, ".nc": write_netcdf, ".npz": write_npz, ".mat": write_mat, ".csv": write_csv}
+
+
+def export_geometry(
+    path: str | os.PathLike[str],
+    measurement: Measurement,
+    grid: Grid,
+    program: str,
+    say: Callable[[str], None] = lambda line: None,
+) -> None:
+    """Write cameras and grid as the geometry of a tomography program, one of PROGRAMS, to a .npz file.
+
+    Parameters
+    ----------
+    say : called with lines about what the geometry does not hold
+    """
+    import numpy as np
+
+    if program not in PROGRAMS:
+        raise InputError(f"expected {' or '.join(PROGRAMS)}, got '{program}'", field="format")
+    if ending(path) != ".npz":
+        raise InputError(f"expected a name ending in .npz for the geometry of {program}, got '{path}'", field="out")
+    cameras, (_, rows, columns) = measurement.cameras, measurement.shape
+    size = (rows, columns)
+    arrays = astra_of(cameras, size, grid) if program == "astra" else tigre_of(cameras, size, grid, say)
+    if names := [c.name for c in cameras if c.lens is not None and c.lens.wide]:
+        say(f"apertures and windows are no part of the geometry, whose rays are thin: {', '.join(names)}")
+    arrays |= {"views": np.array(measurement.names), "image_size": np.array([c.image_size for c in cameras])}
+    with atomic(path) as part, part.open("wb") as file:
+        np.savez(file, **arrays)

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nerif.common.conventions import COMPONENTS, DEFAULT_AMBIENT_FACES, InputError, parse_faces
+from nerif.common.conventions import COMPONENTS, DEFAULT_AMBIENT_FACES, InputError, parse_faces, whole
 from nerif.common.netcdf import reading, values
 from nerif.data.measurement import Measurement
 from nerif.forward.base import ForwardModel
@@ -291,8 +291,8 @@ def _projections(dataset: xr.Dataset) -> list[Projection]:
 
 def _cameras(dataset: xr.Dataset) -> tuple[Camera, ...]:
     views, names, projections = dataset.sizes["view"], _names(dataset), _projections(dataset)
-    whole = torch.tensor([dataset.sizes["row"], dataset.sizes["column"]], dtype=torch.float64).expand(views, 2)
-    sizes = _array(dataset, "image_size") if "image_size" in dataset else whole
+    full = torch.tensor([dataset.sizes["row"], dataset.sizes["column"]], dtype=torch.float64).expand(views, 2)
+    sizes = _array(dataset, "image_size") if "image_size" in dataset else full
     distortion, tilt = (_optional(dataset, n, (views, k), 0.0) for n, k in (("distortion", 5), ("tilt", 2)))
     intrinsics, rotation, translation = (_array(dataset, n) for n in ("intrinsics", "rotation", "translation"))
     normals = _optional(dataset, "background_normal", (views, 3))
@@ -301,13 +301,13 @@ def _cameras(dataset: xr.Dataset) -> tuple[Camera, ...]:
     lenses = _lenses(dataset, names)
     cameras = []
     for i, name in enumerate(names):
-        height, width = sizes[i].tolist()
+        height, width = (whole(edge, f"image_size of view '{name}'") for edge in sizes[i].tolist())
         cameras.append(
             Camera(
                 intrinsics=intrinsics[i],
                 rotation=rotation[i],
                 translation=translation[i],
-                image_size=(int(height), int(width)),
+                image_size=(height, width),
                 background=_plane(normals[i], offsets[i], name),
                 distortion=distortion[i],
                 name=name,

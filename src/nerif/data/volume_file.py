@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from nerif.common.conventions import LARGEST_INDEX, LARGEST_LENGTH, STATISTICS, InputError
-from nerif.common.files import atomic
+from nerif.common.files import atomic, ending
 from nerif.common.netcdf import opened, values
 from nerif.data.volume import QUANTITIES, Volume, describe, field_of, name_of
 from nerif.data.vti import read_vti
@@ -118,10 +118,10 @@ def _read(path: Path) -> Content:
     """Return the content of a file; attributes of one quantity under density.assumption and the like."""
     if not path.is_file():
         raise InputError("no such file; expected a volume (.nc or .vti)", field=path)
-    if path.suffix == ".nc":
+    if ending(path) == ".nc":
         with opened(path, "a volume (.nc or .vti)") as dataset:
             return _content(dataset)
-    if path.suffix == ".vti":
+    if ending(path) == ".vti":
         return read_vti(path)
     raise InputError(f"expected a volume in .nc or .vti, got '{path.suffix or path.name}'", field=path)
 

@@ -13,7 +13,7 @@ from annotated_types import Ge
 from jaxtyping import Bool, Shaped
 
 from nerif.common.conventions import InputError, unit_shown
-from nerif.common.files import atomic
+from nerif.common.files import atomic, ending
 from nerif.common.settings import NonNegative, Positive, check_settings
 from nerif.data.measurement import Measurement, Observation, integrals_of
 from nerif.imaging.readers.frames import as_float
@@ -170,7 +170,7 @@ def drawn_masks(
     if not folder.is_dir():
         raise InputError("no such folder; expected one with VIEW.png for each view", field=folder)
     names = tuple(names)
-    files = [p for p in sorted(folder.iterdir()) if p.suffix.lower() in FOLDER_SUFFIXES and p.name[0] != "."]
+    files = [p for p in sorted(folder.iterdir()) if ending(p) in FOLDER_SUFFIXES and p.name[0] != "."]
     masks: dict[str, Path] = {}
     for path in files:
         fitting = [n for n in names if n == path.stem] or [n for n in names if n.lower() == path.stem.lower()]

@@ -14,7 +14,7 @@ import numpy as np
 from annotated_types import Gt, Le, Lt
 
 from nerif.common.conventions import InputError
-from nerif.common.files import atomic
+from nerif.common.files import atomic, ending
 from nerif.common.settings import check_settings
 from nerif.imaging.calibration.targets import CalibrationTarget
 
@@ -152,7 +152,7 @@ def print_pattern(path: Path, pattern: Background | CalibrationTarget, dpi: floa
 
     `dpi` is an upper limit of the resolution, which coarse patterns do not need.
     """
-    if path.suffix not in (".pdf", ".png"):
+    if ending(path) not in (".pdf", ".png"):
         raise InputError(f"expected a name ending in .pdf or .png, got '{path.name}'", field="out")
     if not dpi > 0:
         raise InputError(f"expected a positive number, got {dpi}", field="dpi")
@@ -163,17 +163,19 @@ def print_pattern(path: Path, pattern: Background | CalibrationTarget, dpi: floa
         raise InputError(f"expected up to {MAX_PIXELS:.0e} pixels, got {pixels:.1e}; lower dpi", field="width, height")
     raster = pattern.raster(pixel)
     with atomic(path) as part:
-        if path.suffix == ".png":
+        if ending(path) == ".png":
             import imageio.v3 as iio
 
-            iio.imwrite(part, np.round(raster * 255).astype(np.uint8), dpi=(25.4 / pixel, 25.4 / pixel))
+            resolution = 25.4 / pixel
+            values = np.round(raster * 255).astype(np.uint8)
+            iio.imwrite(part, values, extension=".png", dpi=(resolution, resolution))
         else:
             _page(raster, pixel, pattern.label).savefig(part)
 
 
 def paper_for(path: Path, pattern: Background | CalibrationTarget) -> str:
     """Return the smallest paper for the file of a pattern: A4 to A0, or a plotter."""
-    margin = 2 * MARGIN if path.suffix == ".pdf" else 0
+    margin = 2 * MARGIN if ending(path) == ".pdf" else 0
     short, long = sorted(length + margin for length in pattern.size)
     return next((name for name, (a, b) in PAGES.items() if long <= a and short <= b), "a plotter")
 

@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 
 from nerif.common.conventions import InputError
-from nerif.common.files import atomic
+from nerif.common.files import atomic, ending
 from nerif.common.installation import install
 from nerif.common.settings import check_settings
 from nerif.data.volume import Volume, field_of
@@ -135,7 +135,7 @@ class Movie:
         frames : available frames of the store
         on_frame : called with the number of finished frames
         """
-        if path.suffix not in FORMATS:
+        if ending(path) not in FORMATS:
             raise InputError(f"expected a name ending in {' or '.join(FORMATS)}, got '{path.name}'", field="out")
         if not len(frames):
             raise InputError("expected at least one finished frame, got none", field=store.path)
@@ -197,7 +197,7 @@ def _writer(path: Path, frames_per_second: float) -> Any:
         import imageio.v2 as imageio
         import pyvista  # noqa: F401
 
-        if path.suffix == ".gif":
+        if ending(path) == ".gif":
             return imageio.get_writer(path, mode="I", duration=1000 / frames_per_second, loop=0)
         import imageio_ffmpeg  # noqa: F401
     except ImportError as error:

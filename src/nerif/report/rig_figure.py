@@ -33,7 +33,8 @@ def draw_rig(axes: Axes3D, cameras: Sequence[Camera], box: Box | None = None) ->
 
     corners = [image_corners(c, np.zeros(3) if box is None else np.array(box.centre)) for c in cameras]
     centres = np.stack([c.start.mean(axis=0) for c in corners])
-    extent = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max()) or float(np.linalg.norm(centres[0]))
+    spread = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
+    extent = spread or float(np.linalg.norm(centres[0])) or 1.0
     points = [centres]
     rank = np.argsort(np.argsort(np.arctan2(*(centres - centres.mean(axis=0)).T[1::-1])))
     for i, (camera, corner, centre) in enumerate(zip(cameras, corners, centres, strict=True)):
@@ -50,7 +51,8 @@ def draw_rig(axes: Axes3D, cameras: Sequence[Camera], box: Box | None = None) ->
             axes.plot(*corner.end[:2].T, color=colour, linewidth=3)
         target = corner.end.mean(axis=0)
         axes.plot(*np.stack([centre, target]).T, color=colour, linewidth=0.4, alpha=0.6)
-        outward = (centre - target) / np.linalg.norm(centre - target)
+        outward = -corner.direction.mean(axis=0)  # the target may lie in the camera, if that is the world
+        outward /= np.linalg.norm(outward)
         name_at = centre + (0.09, 0.2)[rank[i] % 2] * extent * outward  # so that names of neighbours do not overlap
         axes.text(*name_at, camera.name, color=colour, fontsize=6.5, ha="center", va="center", parse_math=False)
         points += [name_at[None], corner.start, corner.end]

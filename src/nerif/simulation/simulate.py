@@ -18,6 +18,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerif.common.conventions import AMBIENT_INDEX, DEFAULT_AMBIENT_FACES, InputError
+from nerif.common.files import ending
 from nerif.common.settings import Count, check_settings
 from nerif.data.measurement import Measurement, measurement_of
 from nerif.data.measurement_sequence import MeasurementSequence
@@ -237,7 +238,7 @@ class Simulation:
 
     @property
     def _is_file(self) -> bool:
-        return Path(self.phantom).suffix in (".nc", ".vti")
+        return ending(self.phantom) in (".nc", ".vti")
 
     def _field(self) -> tuple[Field, Box, float]:
         """The field, its box, and the ambient index."""

@@ -20,6 +20,7 @@ from nerif.app.workspace import Workspace
 from nerif.cli.commands.reconstruct import Reconstruct, command_of
 from nerif.cli.commands.sequence import Sequence
 from nerif.common.conventions import InputError
+from nerif.common.files import ending
 from nerif.data.measurement_sequence import MeasurementSequence
 from nerif.reconstruction.methods import METHODS
 from nerif.reconstruction.neural.presets import PRESETS, preset
@@ -93,7 +94,7 @@ class ReconstructPage:
     @property
     def film(self) -> bool:
         """Whether the selected measurement is a film."""
-        return self.measurement.name.endswith(FILM)
+        return ending(self.measurement.name) == FILM
 
     def _free_name(self) -> str:
         stem = PurePosixPath(self.measurement.name or "run").stem

@@ -14,6 +14,7 @@ import tyro
 from nerif.cli.commands.output import check_output, counting_bar, say
 from nerif.cli.commands.settings import Flat, Settings, command
 from nerif.common.conventions import InputError
+from nerif.common.files import ending
 from nerif.data.measurement import Measurement
 from nerif.geometry import Box, Camera
 from nerif.imaging.calibration.calibrate import CalibrationSettings, calibrate_views, target_images
@@ -33,7 +34,7 @@ class Calibrate(Settings):
 
     SOURCE is a folder of views: VIEW/target/*.tif (target in free space, the same number for the same pose in all
     views) and VIEW/background/*.tif (target on the background of the view), or with a views.toml; or a calibration of
-    another program (.mat, .yml, .xml, transforms.json, .csv, .toml). --check only draws the rig.
+    another program (.mat, .yml, .xml, transforms.json, .npz, .csv, .toml). --check only draws the rig.
 
     With --simple, SOURCE is a folder with one view (VIEW/reference) or an image; the camera, which looks across the
     axis of a flow, follows from --distance, --background-distance and --mm-per-px.
@@ -91,7 +92,7 @@ def run(settings: Calibrate) -> None:
     imports = settings.taken_over
     if no_images:
         cameras, box = (
-            import_cameras(settings.source, imports, settings.views),
+            import_cameras(settings.source, imports, settings.views, say),
             box or import_box(settings.source, imports),
         )
         write_cameras(out, cameras, {"source": str(settings.source)}, box)
@@ -119,10 +120,10 @@ def _cameras(settings: Calibrate, box: Box | None) -> tuple[Sequence[CalibratedC
     if settings.simple:
         camera, box = _simple(settings, box)
         return (camera,), box
-    if settings.source.suffix == ".nc":
+    if ending(settings.source) == ".nc":
         measurement = Measurement.read(settings.source)
         return measurement.cameras, box or measurement.box
-    cameras = import_cameras(settings.source, settings.taken_over, settings.views)
+    cameras = import_cameras(settings.source, settings.taken_over, settings.views, say)
     return cameras, box or import_box(settings.source, settings.taken_over)
 
 

@@ -13,6 +13,7 @@ from nerif.analysis.evaluation import FLOW, evaluate, rms_with_unit
 from nerif.cli.commands.output import counting_bar, say
 from nerif.cli.commands.settings import Settings, command
 from nerif.common.conventions import InputError
+from nerif.common.files import ending
 from nerif.data.volume import INDEX, name_of
 from nerif.results.metrics import ViewScores
 
@@ -37,7 +38,7 @@ class Evaluate(Settings):
 
 def run(settings: Evaluate) -> dict[str, Any]:
     """Print the metrics and return them."""
-    if settings.result.suffix == ".zarr":
+    if ending(settings.result) == ".zarr":
         return _run_over_time(settings)
     with counting_bar("re-projecting") as bar:
         metrics = evaluate(

@@ -1,17 +1,18 @@
-"""nerif export: a reconstruction on any grid, for other programs."""
+"""nerif export: a reconstruction on any grid, or the geometry of a measurement, for other programs."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
 from nerif.cli.commands.output import check_output, counting_bar, say
 from nerif.cli.commands.settings import Settings, command
 from nerif.common.conventions import InputError
-from nerif.data.exports import FORMATS, export
+from nerif.data.exports import FORMATS, PROGRAMS, export, export_geometry
+from nerif.data.measurement import Measurement
 from nerif.data.volume import Volume, quantities_of
 from nerif.geometry import Box, Grid
 from nerif.physics.quantities import GasChanges, derive, masked_lines
@@ -22,12 +23,17 @@ __all__ = ["Export", "main", "run"]
 
 @dataclass(frozen=True)
 class Export(Settings):
-    """Write a reconstruction as .vti (ParaView), .nc, .npz, .mat or .csv, on any grid."""
+    """Write a reconstruction as .vti (ParaView), .nc, .npz, .mat or .csv, on any grid.
+
+    With --format astra or tigre, write cameras and grid of a measurement as the geometry of that program.
+    """
 
     result: Annotated[Path, tyro.conf.Positional]
-    """Result directory of nerif reconstruct."""
+    """Result directory of nerif reconstruct; for astra and tigre a measurement (.nc)."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
-    """Output file; format by its ending: .vti, .nc, .npz, .mat or .csv."""
+    """Output file; format by its ending: .vti, .nc, .npz, .mat or .csv; for astra and tigre .npz."""
+    format: Literal["field", *PROGRAMS] = "field"  # type: ignore[valid-type]
+    """What to write: the field, or cameras and grid for astra or tigre."""
     quantities: tuple[str, ...] = ()
     """Quantities to write; of an index index_excess (1), n (1), density (kg/m3), temperature (K) (default: all but
     temperature)."""
@@ -47,16 +53,18 @@ class Export(Settings):
 
 def run(settings: Export) -> None:
     """Write the file."""
-    check_output(settings.out, settings.force, endings=tuple(FORMATS))
+    check_output(settings.out, settings.force, endings=tuple(FORMATS) if settings.format == "field" else (".npz",))
+    if settings.format != "field":
+        if settings.quantities:
+            raise InputError(f"expected none with --format {settings.format}, which has no field", field="quantities")
+        measurement = Measurement.read(settings.result)
+        grid = _grid(settings, measurement.box)
+        export_geometry(settings.out, measurement, grid, settings.format, lambda line: say(f"note: {line}"))
+        say(f"{settings.out}: {len(measurement.cameras)} views and {' x '.join(map(str, grid.shape))} voxels (z, y, x)")
+        return
     result = ResultDirectory(settings.result)
     (field, whole, n_ambient), quantity = result.field(), result.quantity()
-    box = Box(settings.lower or whole.lower, settings.upper or whole.upper)
-    if not whole.holds(box):
-        raise InputError(
-            f"expected a part of the box {whole.lower} to {whole.upper} mm, got {box.lower} to {box.upper}",
-            field="lower, upper",
-        )
-    grid = Grid(box, settings.shape) if settings.shape else Grid.of_resolution(box, settings.voxels)
+    grid = _grid(settings, whole)
     quantities = settings.quantities or tuple(q for q in quantities_of(quantity) if q != "temperature")
     with counting_bar("sampling the field"):
         reconstruction = Volume.of(field.sample(grid), grid, quantity, n_ambient)
@@ -66,6 +74,17 @@ def run(settings: Export) -> None:
     say(f"{settings.out}: {', '.join(quantities)} on {' x '.join(map(str, grid.shape))} voxels (z, y, x)")
     for line in masked_lines(volumes):
         say(line)
+
+
+def _grid(settings: Export, whole: Box) -> Grid:
+    """Return the grid of the settings within a box."""
+    box = Box(settings.lower or whole.lower, settings.upper or whole.upper)
+    if not whole.holds(box):
+        raise InputError(
+            f"expected a part of the box {whole.lower} to {whole.upper} mm, got {box.lower} to {box.upper}",
+            field="lower, upper",
+        )
+    return Grid(box, settings.shape) if settings.shape else Grid.of_resolution(box, settings.voxels)
 
 
 main = command("export", Export, run)

@@ -15,6 +15,7 @@ from nerif.analysis.evaluation import rms_with_unit
 from nerif.cli.commands.output import say
 from nerif.cli.commands.settings import Settings, command
 from nerif.common.conventions import InputError, with_unit
+from nerif.common.files import ending
 from nerif.common.netcdf import opened
 from nerif.data.measurement import Measurement
 from nerif.data.measurement_file import known_conventions
@@ -40,7 +41,7 @@ def run(settings: Info) -> None:
     path = settings.path
     if path.is_dir():
         _result(path)
-    elif path.suffix == ".vti" or (path.suffix == ".nc" and path.is_file() and not is_measurement(path)):
+    elif ending(path) == ".vti" or (ending(path) == ".nc" and path.is_file() and not is_measurement(path)):
         _volume(path, read_volume(path))
     else:
         _measurement(path, Measurement.read(path))

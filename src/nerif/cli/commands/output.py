@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from nerif.common.conventions import InputError
+from nerif.common.files import ending
 from nerif.reconstruction.base import OnStep, Step, compose
 from nerif.reconstruction.progress import Monitor
 
@@ -46,12 +47,12 @@ def check_output(path: Path, force: bool, *others: Path, endings: tuple[str, ...
     ----------
     others : files written beside it
     """
-    if endings and path.suffix not in endings:
+    if endings and ending(path) not in endings:
         raise InputError(f"expected a name ending in {' or '.join(endings)}, got '{path.name}'", field="out")
     for file in (path, *others):
         if not file.parent.is_dir():
             raise InputError(f"the folder {file.parent} does not exist; create it", field=file)
-        if file.is_dir() and file.suffix != ".zarr":
+        if file.is_dir() and ending(file) != ".zarr":
             raise InputError("expected the name of a file, got a folder", field=file)
         if file.exists() and not force:
             raise InputError("exists already and was left as it is; give another --out, or --force", field=file)

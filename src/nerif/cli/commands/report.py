@@ -11,6 +11,7 @@ import tyro
 from nerif.cli.commands.output import MONITOR, check_output
 from nerif.cli.commands.settings import Settings, command
 from nerif.common.conventions import InputError
+from nerif.common.files import ending
 from nerif.results.directory import REPORT
 from nerif.workflow.reports import write_report, write_sequence_report
 
@@ -31,7 +32,7 @@ class Report(Settings):
 
 def run(settings: Report) -> Path:
     """Write the report, and print what it lacks."""
-    is_store = settings.result.suffix == ".zarr"
+    is_store = ending(settings.result) == ".zarr"
     out = settings.out or (settings.result.with_suffix(".html") if is_store else settings.result / REPORT)
     if settings.out is not None:
         check_output(out, settings.force, endings=(".html", ".htm"))

@@ -24,7 +24,7 @@ from typing import Any, Self, TypeVar
 import tyro
 
 from nerif.common.conventions import InputError
-from nerif.common.files import check_known, read_toml
+from nerif.common.files import check_known, local_path, read_toml
 from nerif.common.settings import check_settings
 
 __all__ = [
@@ -57,6 +57,9 @@ class Settings:
     """TOML file of settings, such as the run.toml of a result; options override it."""
 
     def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            if isinstance(value := getattr(self, field.name), Path):
+                object.__setattr__(self, field.name, local_path(value, Path(), field.name))
         check_settings(self)
 
     @classmethod

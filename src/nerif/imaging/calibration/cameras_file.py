@@ -47,7 +47,9 @@ FORMAT = "nerif-calibration-1"
 ARRAYS = ("intrinsics", "distortion", "rotation", "translation")
 LENS = ("aperture_diameter", "focus_distance")
 KEYS = ("name", "projection", "image_size", *ARRAYS, "tilt", "background", *LENS, "pose_sigma")
-BROWN = ("brown", "opencv", "perspective", "pinhole", "plumb_bob", "radial", "simple_pinhole", "simple_radial")
+BROWN = (
+    "brown", "opencv", "perspective", "pinhole", "plumb_bob", "radial", "radtan", "simple_pinhole", "simple_radial",
+)  # fmt: skip
 """Names that programs give to camera models with Brown's distortion (k1, k2, p1, p2, k3)."""
 LIKE_DISTORTION = re.compile("(?<!un)dist(?!an)|^tau_?[xy]|tilt", re.IGNORECASE)  # not undistorted images, distances
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from nerif.common.conventions import InputError
+from nerif.common.files import ending
 from nerif.imaging.readers.frames import Frames
 
 __all__ = ["ArrayFrames", "Hdf5Frames"]
@@ -17,7 +18,7 @@ class ArrayFrames(Frames):
 
     def __init__(self, path: Path, name: str, dataset: str) -> None:
         try:
-            if path.suffix.lower() == ".npy":
+            if ending(path) == ".npy":
                 arrays = {"array": np.load(path, mmap_mode="r", allow_pickle=False)}
             else:
                 with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:

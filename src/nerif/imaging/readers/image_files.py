@@ -15,6 +15,7 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 
 from nerif.common.conventions import InputError
+from nerif.common.files import ending
 from nerif.common.installation import install
 from nerif.imaging.readers.camera_raw import RAW_SUFFIXES, CameraRaw
 from nerif.imaging.readers.frames import Frames, check_size
@@ -288,7 +289,7 @@ class Image(ImageFile):
     def read(self, i: int) -> np.ndarray:
         from imageio import v3
 
-        return v3.imread(self._path.read_bytes(), extension=self._path.suffix.lower())
+        return v3.imread(self._path.read_bytes(), extension=ending(self._path))
 
 
 class LaVision(ImageFile):
@@ -368,7 +369,7 @@ OPENERS: dict[str, type[ImageFile]] = {
 
 
 def _opener(path: Path) -> type[ImageFile]:
-    return OPENERS[path.suffix.lower()]
+    return OPENERS[ending(path)]
 
 
 def _as_rgb(image: np.ndarray) -> np.ndarray:

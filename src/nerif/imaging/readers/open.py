@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from nerif.common.conventions import InputError
+from nerif.common.files import ending, local_path
 from nerif.imaging.readers.array_files import ArrayFrames, Hdf5Frames
 from nerif.imaging.readers.cine import CineFrames
 from nerif.imaging.readers.frames import Frames, SelectedFrames, size_in_words
@@ -24,7 +25,7 @@ from nerif.imaging.readers.image_files import OPENERS, FileFrames
 from nerif.imaging.readers.photron import PhotronFrames
 from nerif.imaging.readers.video import VideoFrames
 
-__all__ = ["FOLDER_SUFFIXES", "open_frames", "read_mask"]
+__all__ = ["FOLDER_SUFFIXES", "SUFFIXES", "open_frames", "read_mask"]
 
 FOLDER_SUFFIXES = tuple(suffix for suffix in OPENERS if suffix != ".vc7")
 FILMS: dict[str, Callable[[Path, str], Frames]] = {
@@ -51,10 +52,12 @@ def open_frames(spec: str | Path, base: Path | None = None) -> Frames:
         each optionally followed by a selection in the syntax of Python: ``rec.cihx[0:50]``, ``rec.cihx[7]``,
         ``stack.tif[::2]``. HDF5 and .npz files may name a dataset: ``file.h5:/path/to/dataset``. Square brackets
         elsewhere are literal; classes such as ``ref_[ab].tif`` are not patterns.
+        Relative paths may be written as on Windows.
     base : folder of a relative spec, omitted from the names in messages
     """
-    text, selection, dataset = str(spec), "", ""
+    selection, dataset = "", ""
     root = Path() if base is None else Path(base)
+    text = str(local_path(spec, root, "images"))
     if (match := SELECTION.fullmatch(text)) and not (root / text).exists():
         text, selection = match.groups()
     if (match := DATASET.fullmatch(text)) and not (root / text).exists():
@@ -85,11 +88,11 @@ def read_mask(path: Path, shape: tuple[int, int]) -> Bool[np.ndarray, "row colum
 
 def _open_files(files: list[Path], names: list[str], dataset: str = "") -> Frames:
     for path, name in zip(files, names, strict=True):
-        if path.suffix.lower() not in SUFFIXES:
+        if ending(path) not in SUFFIXES:
             raise InputError(f"expected one of {READ}, got '{path.suffix}'; {EXPORT}", field=name)
-        if len(files) > 1 and path.suffix.lower() in SINGLE_SUFFIXES:
+        if len(files) > 1 and ending(path) in SINGLE_SUFFIXES:
             raise InputError(f"one of {len(files)} files of a pattern; name one recording at a time", field=name)
-    suffix = files[0].suffix.lower()
+    suffix = ending(files[0])
     if suffix in FILMS:
         return FILMS[suffix](files[0], names[0])
     if suffix in ARRAYS:
@@ -116,16 +119,18 @@ def _find_files(path: Path, base: Path | None) -> list[Path]:
     """Files of a file name, folder or pattern, in natural order."""
     label = _label(path, base)
     if path.is_dir():
-        files = [p for p in path.iterdir() if p.suffix.lower() in FOLDER_SUFFIXES and not p.name.startswith(".")]
+        files = [p for p in path.iterdir() if ending(p) in FOLDER_SUFFIXES and not p.name.startswith(".")]
         if not files:
             inside = [p for p in path.iterdir() if not p.name.startswith(".")]
             raise InputError(f"expected images, got {_content(inside, base)}", field=label)
     elif path.is_file():
         return [path]
     elif re.search(r"[*?]", str(path)):
-        names = glob.glob(str(path).replace("[", "[[]"), recursive=True)
+        # *.tif is also *.TIF, as on Windows
+        classes = [f"[{c}{c.upper()}]" if c.isalpha() else c for c in ending(path)]
+        names = glob.glob(str(path.with_suffix("")).replace("[", "[[]") + "".join(classes), recursive=True)
         matches = [p for p in map(Path, names) if p.is_file()]
-        files = [p for p in matches if p.suffix.lower() in SUFFIXES]
+        files = [p for p in matches if ending(p) in SUFFIXES]
         if not files:
             content = _content(matches, base) if matches else f"none{_nearest(path, base)}"
             raise InputError(f"expected files of this pattern, got {content}", field=label)

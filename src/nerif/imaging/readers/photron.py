@@ -8,13 +8,14 @@ from pathlib import Path
 import numpy as np
 
 from nerif.common.conventions import InputError
+from nerif.common.files import ending
 from nerif.imaging.readers.frames import Frames, check_size
 from nerif.imaging.readers.packed import unpack
 
 __all__ = ["PhotronFrames"]
 
 NUMBERS = ("Color Bit", "EffectiveBit Depth", "Total Frame", "Image Height", "Image Width", "Record Rate(fps)")
-"""Positive numbers that a .cih header must have."""
+"""Positive numbers that a .cih header must have, whole ones except the rate."""
 
 MOST_FRAMES = 2**26  # more than any camera's memory holds
 
@@ -36,7 +37,7 @@ class PhotronFrames(Frames):
     """A Photron recording, of which every n-th frame was saved (Save Step n); the time of frame i is i n / rate."""
 
     def __init__(self, path: Path, name: str) -> None:
-        is_data = path.suffix.lower() == ".mraw"
+        is_data = ending(path) == ".mraw"
         header_path = _partner(path, name, (".cihx", ".cih")) if is_data else path
         self._path = path if is_data else _partner(path, name, (".mraw",))
         self._name = Path(name).with_name(self._path.name).as_posix()
@@ -81,10 +82,11 @@ class PhotronFrames(Frames):
 
 
 def _partner(path: Path, name: str, suffixes: tuple[str, ...]) -> Path:
-    """Return the file of the same name with one of these suffixes, in small or capital letters."""
+    """Return the file of the same name with one of these suffixes; small and capital letters are the same."""
+    others = sorted(path.parent.iterdir(), key=lambda other: other.stem != path.stem)
     for suffix in suffixes:
-        for other in sorted(path.parent.iterdir()):
-            if other.stem == path.stem and other.suffix.lower() == suffix:
+        for other in others:
+            if other.stem.lower() == path.stem.lower() and ending(other) == suffix:
                 return other
     raise InputError(f"expected a {' or '.join(suffixes)} file of the same name beside it, got none", field=name)
 
@@ -93,7 +95,7 @@ def _header(path: Path, name: str) -> dict[str, str]:
     """Return the entries of a header by the keys of a .cih."""
     try:
         text = path.read_bytes().decode("utf-8", errors="ignore")
-        cih = _from_xml(text) if path.suffix.lower() == ".cihx" else _from_lines(text)
+        cih = _from_xml(text) if ending(path) == ".cihx" else _from_lines(text)
         *counts, rate = (float(cih[key]) if key == NUMBERS[-1] else int(cih[key]) for key in NUMBERS)
         positive = min(*counts, rate) > 0 and counts[2] <= MOST_FRAMES
         float(cih.get("Save Step") or 1)

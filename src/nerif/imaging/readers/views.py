@@ -29,18 +29,24 @@ import numpy as np
 from jaxtyping import Bool
 
 from nerif.common.conventions import InputError
-from nerif.common.files import check_known, read_toml, write_toml
+from nerif.common.files import check_known, ending, local_path, read_toml, write_toml
 from nerif.imaging.readers.crop import Crop
 from nerif.imaging.readers.exposure import check_exposure, full_scale
 from nerif.imaging.readers.frames import Frames, read_each, size_in_words
-from nerif.imaging.readers.open import open_frames, read_mask
+from nerif.imaging.readers.open import SUFFIXES, open_frames, read_mask
 
-__all__ = ["BEFORE", "SOURCES", "Images", "View", "find_views", "good_images", "read_sample", "write_crops"]
+__all__ = [
+    "BEFORE", "SOURCES", "VIEWS", "Images", "View", "find_views", "good_images", "read_sample", "views_file",
+    "write_crops",
+]  # fmt: skip
 
 SOURCES = ("target", "background", "reference", "flow", "mask", "region")
 """Images of a view: target, target on the background, without and with flow, and two drawn masks."""
 
 CROP = tuple(f.name for f in fields(Crop))
+HEADS = tuple(suffix for suffix in SUFFIXES if suffix != ".mraw")
+"""Endings of files of images; the .mraw of a Photron recording stands beside its header."""
+VIEWS = "views.toml"
 BEFORE = "views.before.toml"
 """Copy of a views.toml as it was before its first change, with its comments."""
 
@@ -71,7 +77,7 @@ class View:
         if source not in self.sources:
             raise InputError(
                 f"no {source} images; expected {self.folder / self.name / source}/ or a line "
-                f'{source} = "..." in {self.folder / "views.toml"}',
+                f'{source} = "..." in {self.folder / VIEWS}',
                 field=f"view '{self.name}'",
             )
         if source not in self._opened:
@@ -112,7 +118,7 @@ def find_views(folder: Path, only: Sequence[str] = ()) -> tuple[View, ...]:
     """Find the views of an experiment: those named in `only`, or all."""
     if not folder.is_dir():
         raise InputError("no such folder; expected one with a folder for each view", field=folder)
-    file = folder / "views.toml"
+    file = views_file(folder)
     views = _from_file(file) if file.is_file() else _from_folders(folder)
     if not views:
         raise InputError(
@@ -127,19 +133,33 @@ def find_views(folder: Path, only: Sequence[str] = ()) -> tuple[View, ...]:
     return tuple(v for v in views if not only or v.name in only)
 
 
+def views_file(folder: Path) -> Path:
+    """Return the path of the views.toml of a folder, in small or capital letters, whether it exists or not."""
+    return next((p for p in sorted(folder.iterdir()) if p.name.lower() == VIEWS), folder / VIEWS)
+
+
 def _from_folders(folder: Path) -> list[View]:
-    """Each folder with an entry named as one of SOURCES is a view."""
-    views = []
+    """Each folder with an entry named as one of SOURCES, in small or capital letters, is a view."""
+    views: dict[str, View] = {}
     for inner in sorted((p for p in folder.iterdir() if p.is_dir()), key=_natural):
-        entries = {
-            source: str(entry.relative_to(folder))
-            for source in SOURCES
-            for entry in sorted(inner.iterdir())
-            if (entry.name if entry.is_dir() else entry.stem) == source and not entry.name.endswith(".mraw")
-        }
+        entries: dict[str, str] = {}
+        for entry in sorted(inner.iterdir()):
+            source = (entry.name if entry.is_dir() else entry.stem).lower()
+            if source not in SOURCES or not (entry.is_dir() or ending(entry) in HEADS):
+                continue
+            path = entry.relative_to(folder).as_posix()
+            _check_second(entries.get(source), path, folder)
+            entries[source] = path
         if entries:
-            views.append(View(inner.name, folder, entries))
-    return views
+            _check_second(views[key].name if (key := inner.name.lower()) in views else None, inner.name, folder)
+            views[key] = View(inner.name, folder, entries)
+    return list(views.values())
+
+
+def _check_second(first: str | None, second: str, folder: Path) -> None:
+    """Refuse two entries of one meaning, such as flow and Flow, or flow and flow.tif."""
+    if first is not None:
+        raise InputError(f"expected either {first} or {second}, got both; rename or remove one", field=folder)
 
 
 def _natural(path: Path) -> tuple[list[float], str]:
@@ -161,7 +181,11 @@ def _from_file(file: Path) -> list[View]:
             if not isinstance(value, kind) or isinstance(value, bool):
                 raise InputError(f"'{key}' of view '{name}': expected {kind.__name__}, got {value!r}", field=file)
         crop = {k: v for k, v in entries.items() if k in CROP}
-        sources = {k: v for k, v in entries.items() if k in SOURCES}
+        sources = {
+            k: str(local_path(v, file.parent, f"{file}: {k} of view '{name}'"))
+            for k, v in entries.items()
+            if k in SOURCES
+        }
         views.append(View(name, file.parent, sources, Crop(**crop) if crop else None))
     return views
 
@@ -172,7 +196,7 @@ def write_crops(folder: Path, crops: Mapping[str, Crop]) -> Path:
     Other views keep theirs; a folder without the file gets one that lists all views. Before its first change a file is
     copied to views.before.toml.
     """
-    views, file = find_views(folder), folder / "views.toml"
+    views, file = find_views(folder), views_file(folder)
     check_known(crops, [view.name for view in views], "crops", "view")
     if file.is_file():
         table = read_toml(file)

@@ -9,6 +9,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 from nerif.common.conventions import InputError
+from nerif.common.files import ending
 from nerif.common.interruption import Interrupted
 from nerif.data.measurement import Measurement
 from nerif.data.measurement_sequence import MeasurementSequence
@@ -61,7 +62,7 @@ def reconstruct_sequence(
     say : called with lines of text
     """
     out, measurement, settings = Path(out), Path(measurement), settings or SequenceSettings()
-    if out.suffix != ".zarr":
+    if ending(out) != ".zarr":
         raise InputError(f"expected a name ending in .zarr, got '{out.name}'", field="out")
     if not isinstance(reconstructor, NeRIF):
         raise InputError(f"expected NeRIF for a sequence, got {type(reconstructor).__name__}", field="reconstructor")

@@ -7,7 +7,7 @@ centre of the first pixel, world to camera, mm.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
@@ -16,28 +16,31 @@ import torch
 from annotated_types import Ge, Lt
 
 from nerif.common.conventions import InputError
+from nerif.common.files import ending
 from nerif.common.settings import Positive, check_settings
 from nerif.geometry import Box, Lens, Plane
 from nerif.geometry.distortion import POWERS
 from nerif.imaging.calibration.cameras_file import CalibratedCamera, check_camera, check_names, read_box
+from nerif.imaging.calibration.importers.geometry_files import read_geometry
 from nerif.imaging.calibration.importers.matlab import read_matlab
 from nerif.imaging.calibration.importers.nerfstudio import read_transforms
-from nerif.imaging.calibration.importers.opencv import ENDINGS as OPENCV
-from nerif.imaging.calibration.importers.opencv import read_opencv, read_opencv_folder
 from nerif.imaging.calibration.importers.tables import read_csv, read_tables
+from nerif.imaging.calibration.importers.yaml_files import ENDINGS as YAML
+from nerif.imaging.calibration.importers.yaml_files import read_yaml_files
+from nerif.imaging.readers.views import VIEWS
 
 __all__ = ["ImportSettings", "import_box", "import_cameras", "is_calibration"]
 
-READERS = {".toml": read_tables, ".csv": read_csv, ".json": read_transforms, **dict.fromkeys(OPENCV, read_opencv)}
-ENDINGS = (*READERS, ".mat")
+READERS = {".toml": read_tables, ".csv": read_csv, ".json": read_transforms}
+ENDINGS = (*READERS, *YAML, ".mat", ".npz")
 
 
 @dataclass(frozen=True)
 class ImportSettings:
     """Properties of the cameras that the file of another program may lack."""
 
-    scale_mm: Positive = 1.0
-    """Unit of length of the imported file, mm."""
+    scale_mm: Positive | None = None
+    """Unit of length of the imported file, mm (default: 1; 1000 for files of ROS and kalibr, which are in metres)."""
     pose: int = 1
     """Number of the target image that defines the world frame, for MATLAB files with one pose per image."""
     background_distance: float | None = None
@@ -80,33 +83,40 @@ class ImportSettings:
 
 
 def is_calibration(path: Path) -> bool:
-    """Distinguish a calibration, a file or a folder of OpenCV files, from a folder with images of an experiment."""
+    """Distinguish a calibration, a file or a folder of YAML files, from a folder with images of an experiment."""
     if not path.is_dir():
         return True
     entries = list(path.iterdir())
-    images = any(entry.is_dir() or entry.name == "views.toml" for entry in entries)
-    return not images and any(entry.suffix in OPENCV for entry in entries)
+    images = any(entry.is_dir() or entry.name.lower() == VIEWS for entry in entries)
+    return not images and any(ending(entry) in YAML for entry in entries)
 
 
 def import_cameras(
-    path: Path, settings: ImportSettings = ImportSettings(), only: Sequence[str] = ()
+    path: Path,
+    settings: ImportSettings = ImportSettings(),
+    only: Sequence[str] = (),
+    say: Callable[[str], None] = lambda line: None,
 ) -> tuple[CalibratedCamera, ...]:
-    """Read the cameras of a file, or of a folder with one OpenCV file per camera; errors name the file.
+    """Read the cameras of a file, or of a folder with one YAML file per camera; errors name the file.
 
     Parameters
     ----------
-    path : .toml, .csv, .yml, .yaml, .xml (OpenCV), .json (NeRF), .mat (MATLAB)
+    path : .toml, .csv, .yml, .yaml, .xml (OpenCV, ROS, kalibr), .json (NeRF), .mat (MATLAB), .npz (ASTRA, TIGRE)
     only : names of the cameras to read; all if empty
+    say : called with lines about what was read
     """
     path = Path(path)
     if not path.exists():
         raise InputError(f"no such file; expected a calibration ({' '.join(ENDINGS)})", field=path)
-    if path.is_dir():
-        cameras = read_opencv_folder(path)
-    elif path.suffix == ".mat":
+    unit = 1.0
+    if path.is_dir() or ending(path) in YAML:
+        cameras, unit = read_yaml_files(path, say)
+    elif ending(path) == ".mat":
         cameras = read_matlab(path, settings.pose)
-    elif path.suffix in READERS:
-        cameras = READERS[path.suffix](path)
+    elif ending(path) == ".npz":
+        cameras = read_geometry(path, say)
+    elif ending(path) in READERS:
+        cameras = READERS[ending(path)](path)
     else:
         raise InputError(f"expected a calibration ending in {' '.join(ENDINGS)}, got '{path.suffix}'", field=path)
     if not cameras:
@@ -116,13 +126,14 @@ def import_cameras(
     for name in only:
         if name not in names:
             raise InputError(f"expected some of {', '.join(names)}, got '{name}'", field="views")
+    settings = replace(settings, scale_mm=settings.scale_mm or unit)
     return tuple(check_camera(_completed(c, settings), str(path)) for c in cameras if not only or c.name in only)
 
 
 def import_box(path: Path, settings: ImportSettings = ImportSettings()) -> Box | None:
     """Read the box of a calibration, mm; None if it has none."""
-    box = read_box(path) if Path(path).suffix == ".toml" else None
-    if box is None or settings.scale_mm == 1:
+    box = read_box(path) if ending(path) == ".toml" else None
+    if box is None or settings.scale_mm is None:
         return box
     (a, b, c), (d, e, f) = (torch.tensor([box.lower, box.upper], dtype=torch.float64) * settings.scale_mm).tolist()
     return Box((a, b, c), (d, e, f))
@@ -130,7 +141,7 @@ def import_box(path: Path, settings: ImportSettings = ImportSettings()) -> Box |
 
 def _lens(lens: Lens | None, settings: ImportSettings) -> Lens | None:
     """Lens of a file in mm, overridden by the settings."""
-    override, scale = settings.lens, settings.scale_mm
+    override, scale = settings.lens, settings.scale_mm or 1.0
     if lens is None or settings.aperture_diameter == 0:
         return override
     scaled = replace(lens, diameter=scale * lens.diameter, focus=None if lens.focus is None else scale * lens.focus)
@@ -141,7 +152,7 @@ def _lens(lens: Lens | None, settings: ImportSettings) -> Lens | None:
 
 def _completed(camera: CalibratedCamera, settings: ImportSettings) -> CalibratedCamera:
     """The camera in mm, completed from the settings."""
-    plane, scale = camera.background, settings.scale_mm
+    plane, scale = camera.background, settings.scale_mm or 1.0
     if plane is not None:
         plane = Plane(plane.normal, scale * plane.offset)
     elif settings.background_distance is not None:

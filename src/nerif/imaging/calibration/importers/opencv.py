@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,9 +12,8 @@ import numpy as np
 from nerif.common.conventions import InputError
 from nerif.imaging.calibration.cameras_file import CalibratedCamera, check_distortion, check_model, flat
 
-__all__ = ["ENDINGS", "read_opencv", "read_opencv_folder"]
+__all__ = ["read_opencv", "read_storage"]
 
-ENDINGS = (".yml", ".yaml", ".xml")
 KEYS = {
     "intrinsics": ("camera_matrix", "cameraMatrix", "Camera_Matrix", "intrinsics", "K", "M"),
     "distortion": ("distortion_coefficients", "distCoeffs", "Distortion_Coefficients", "dist_coeffs", "dist_coeff",
@@ -25,18 +25,30 @@ SIZES = (("image_height", "image_width"), ("Image_Height", "Image_Width"), ("hei
 MODELS = ("camera_model", "distortion_model", "calibration_model")
 OTHER_MODELS = ("fisheye_model", "xi")  # a flag of OpenCV's calibration program; a parameter of omnidirectional cameras
 MAX_CAMERAS = 32  # in one file
+INTRINSICS, EXTRINSICS = "intrinsics", "extrinsics"
+PARTNER = {INTRINSICS: EXTRINSICS, EXTRINSICS: INTRINSICS}
+CONTENT = {INTRINSICS: "the camera matrices M1, D1, M2, D2", EXTRINSICS: "the pose R, T of the second camera"}
+"""Content of the two files of a stereo pair; R1, R2, P1, P2 beside the pose are the rectification, and not read."""
 
 
-def read_opencv_folder(folder: Path) -> list[CalibratedCamera]:
-    """Read a folder with one file per camera, named by the file."""
-    files = sorted(p for p in folder.iterdir() if p.suffix in ENDINGS)
-    if not files:
-        raise InputError(f"expected OpenCV files ({' '.join(ENDINGS)}), one a camera, found none", field=folder)
+def read_opencv(
+    files: Mapping[Path, dict[str, Any]],
+    beside: Callable[[], dict[Path, dict[str, Any]]],
+    say: Callable[[str], None],
+) -> list[CalibratedCamera]:
+    """Read the cameras of a file, or of several with one camera each, named by the file.
+
+    Parameters
+    ----------
+    files : entries by file
+    beside : returns the other files in the folder, for the second one of a stereo pair
+    say : called with a line about files that are read together
+    """
     cameras: dict[str, CalibratedCamera] = {}
     origins: dict[str, Path] = {}
-    for file in files:
-        content = read_opencv(file)
-        for camera in [replace(content[0], name=file.stem)] if len(content) == 1 else content:
+    for file, values in _joined(files, beside, say).items():
+        content = _cameras(file, values)
+        for camera in [replace(content[0], name=file.stem)] if len(content) == 1 < len(files) else content:
             if camera.name in cameras:
                 raise InputError(
                     f"expected cameras of different names, got '{camera.name}' here and in "
@@ -47,11 +59,53 @@ def read_opencv_folder(folder: Path) -> list[CalibratedCamera]:
     return list(cameras.values())
 
 
-def read_opencv(path: Path) -> list[CalibratedCamera]:
-    """Read one camera, several with numbered keys (K1, D1, R1, T1, K2 ...), or a stereo pair with one R and T."""
+def _joined(
+    files: Mapping[Path, dict[str, Any]],
+    beside: Callable[[], dict[Path, dict[str, Any]]],
+    say: Callable[[str], None],
+) -> dict[Path, dict[str, Any]]:  # fmt: skip
+    """Return the files with the two of a stereo pair as one: camera matrices, and the pose of the second camera."""
+    halves = [path for path, values in files.items() if _half(values)]
+    if not halves:
+        return dict(files)
+    everything = {**files, **beside()}
+    joined = {path: values for path, values in files.items() if path not in halves}
+    for path in halves:
+        half = _half(everything[path])
+        partners = [p for p, values in everything.items() if _half(values) == PARTNER[half]]
+        if len(partners) != 1:
+            names = ", ".join(p.name for p in partners) or "none"
+            raise InputError(
+                f"holds {CONTENT[half]}, but not {CONTENT[PARTNER[half]]}, which OpenCV's program stereo_calib writes "
+                f"to {PARTNER[half]}.yml; expected that file beside it, got {names}",
+                field=path,
+            )
+        first, second = (path, partners[0]) if half == INTRINSICS else (partners[0], path)
+        if first not in joined:
+            say(f"{first.name}: read together with {second.name}")
+        joined[first] = everything[second] | everything[first]
+    return joined
+
+
+def _half(values: dict[str, Any]) -> str:
+    """Return which of the two files of a stereo pair this is, empty if neither."""
+    matrices = {suffix for suffix in ("", "1", "2") if _key(values, "intrinsics", suffix)}
+    shifts = any(_key(values, "translation", suffix) for suffix in ("", "1", "2"))
+    if {"1", "2"} <= matrices and not shifts:
+        return INTRINSICS
+    pose = _key(values, "rotation") and _key(values, "translation")
+    return EXTRINSICS if pose and not matrices and not _key(values, "distortion") else ""
+
+
+def _key(values: dict[str, Any], quantity: str, suffix: str = "") -> str:
+    """Return the key of a quantity, empty if there is none."""
+    return next((word + suffix for word in KEYS[quantity] if values.get(word + suffix) is not None), "")
+
+
+def _cameras(path: Path, values: dict[str, Any]) -> list[CalibratedCamera]:
+    """Return one camera, several with numbered keys (K1, D1, R1, T1, K2 ...), or a stereo pair with one R and T."""
     import cv2
 
-    values = _values(path)
     for key in MODELS:
         if values.get(key) is not None:
             check_model(values[key], f"{path}: {key}")
@@ -59,11 +113,8 @@ def read_opencv(path: Path) -> list[CalibratedCamera]:
         if np.any(values.get(key)):
             check_model(key, str(path))
 
-    def key_of(quantity: str, suffix: str) -> str:
-        return next((w + suffix for w in KEYS[quantity] if values.get(w + suffix) is not None), "")
-
     def find(quantity: str, suffix: str) -> Any:
-        return values.get(key_of(quantity, suffix))
+        return values.get(_key(values, quantity, suffix))
 
     suffixes = [s for s in ("", *map(str, range(1, MAX_CAMERAS + 1))) if find("intrinsics", s) is not None]
     if not suffixes:
@@ -72,7 +123,9 @@ def read_opencv(path: Path) -> list[CalibratedCamera]:
             f"several cameras), got {', '.join(values)}",
             field=path,
         )
-    check_distortion(values, {*(key_of("distortion", s) for s in suffixes), *MODELS}, KEYS["distortion"], str(path))
+    check_distortion(
+        values, {*(_key(values, "distortion", s) for s in suffixes), *MODELS}, KEYS["distortion"], str(path)
+    )
     sizes = ([values.get(key) for key in pair] for pair in SIZES)
     size = next((pair for pair in sizes if all(x is not None for x in pair)), None)
     stereo = suffixes == ["1", "2"] and find("translation", "2") is None  # R1 and R2 may be stereoRectify's
@@ -99,7 +152,7 @@ def read_opencv(path: Path) -> list[CalibratedCamera]:
     return cameras
 
 
-def _values(path: Path) -> dict[str, Any]:
+def read_storage(path: Path) -> dict[str, Any]:
     """Read all entries: matrices, sequences as arrays of objects, texts and numbers; None for anything else."""
     import cv2
 
@@ -109,7 +162,7 @@ def _values(path: Path) -> dict[str, Any]:
     except (cv2.error, SystemError):
         keys = []
     if not keys:
-        raise InputError("not a file written by OpenCV's FileStorage, or empty", field=path)
+        raise InputError("not a file of OpenCV's FileStorage, ROS or kalibr, or empty", field=path)
     values: dict[str, Any] = {}
     for key in keys:
         node = storage.getNode(key)

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import codecs
 import csv
 import math
+import re
+from collections import Counter
 from pathlib import Path
 
 from nerif.common.conventions import InputError
@@ -45,25 +48,64 @@ def read_tables(path: Path) -> list[CalibratedCamera]:
 
 
 def read_csv(path: Path) -> list[CalibratedCamera]:
-    """Read one camera per row, from the columns COLUMNS, separated by comma or semicolon."""
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except UnicodeDecodeError:
-        raise InputError("not a text file", field=path) from None
-    lines = [line for line in lines if line.strip() and not line.lstrip().startswith("#")]
+    """Read one camera per row, from the columns COLUMNS, separated by tabs, semicolons or commas.
+
+    Names of columns may have capital letters. Numbers have a decimal point, or all of them a decimal comma.
+    """
+    lines = [line for line in _text(path).splitlines() if line.strip() and not line.lstrip().startswith("#")]
+    if lines and (match := re.fullmatch(r"sep=(.)\s*", lines[0], re.IGNORECASE)):  # Excel's own first line
+        lines = lines[1:]
     if len(lines) < 2:
         raise InputError(f"expected a line of column names and one line a camera, got {len(lines)} lines", field=path)
-    rows = list(csv.DictReader(lines, delimiter=";" if ";" in lines[0] else ",", skipinitialspace=True))
-    columns = [str(name).strip() for name in rows[0]]
-    check_known(columns, COLUMNS, str(path), "column")
+    separator = match[1] if match else next((c for c in "\t;" if c in lines[0]), ",")
+    head, *rows = (
+        [cell.strip() for cell in row] for row in csv.reader(lines, delimiter=separator, skipinitialspace=True)
+    )
+    columns = [name.lower() for name in head]
+    check_known(filter(None, columns), COLUMNS, str(path), "column")
     for column in REQUIRED:
         if column not in columns:
             raise InputError(f"column '{column}' is missing", field=path)
-    return [_row(row, i, path) for i, row in enumerate(rows, start=1)]
+    if twice := [name for name, count in Counter(filter(None, columns)).items() if count > 1]:
+        raise InputError(f"expected each column once, got '{twice[0]}' twice", field=path)
+    tables: list[dict[str, str]] = []
+    for number, row in enumerate(rows, start=2):
+        if any(row[len(columns) :]):
+            raise InputError(
+                f"line {number}: expected {len(columns)} columns, got {len(row)}; separate them by semicolons if the "
+                "numbers have decimal commas",
+                field=path,
+            )
+        tables.append({name: cell for name, cell in zip(columns, row, strict=False) if cell})
+    number_cells = [cell for table in tables for name, cell in table.items() if name not in TEXTS]
+    commas = any("," in cell for cell in number_cells)
+    if commas and (separator == "," or any("." in cell for cell in number_cells)):
+        raise InputError(
+            "expected numbers with decimal points, such as 1500.5, or with decimal commas in a table separated by "
+            "semicolons or tabs, got commas and points, or commas in quotes; remove separators of thousands",
+            field=path,
+        )
+    if commas:
+        tables = [{k: v if k in TEXTS else v.replace(",", ".") for k, v in table.items()} for table in tables]
+    return [_row(cells, i, path) for i, cells in enumerate(filter(None, tables), start=1)]
 
 
-def _row(row: dict, number: int, path: Path) -> CalibratedCamera:
-    cells = {str(k).strip(): str(v).strip() for k, v in row.items() if v is not None and str(v).strip()}
+def _text(path: Path) -> str:
+    """Return the text of a file in UTF-8, in UTF-16 with its mark (Excel's Unicode text) or in Windows-1252."""
+    content = path.read_bytes()
+    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        encodings = ["utf-16"]
+    else:
+        encodings = [] if b"\0" in content else ["utf-8-sig", "cp1252"]
+    for encoding in encodings:
+        try:
+            return content.decode(encoding)
+        except UnicodeDecodeError:
+            continue
+    raise InputError("not a text file in UTF-8 or UTF-16", field=path)
+
+
+def _row(cells: dict[str, str], number: int, path: Path) -> CalibratedCamera:
     x: dict[str, float] = dict.fromkeys(("s", *DISTORTION, *TILT), 0.0)
     for key in (*REQUIRED, *(cells.keys() - {*REQUIRED, *TEXTS})):
         try:

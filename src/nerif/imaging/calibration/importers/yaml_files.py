@@ -1,0 +1,80 @@
+"""Calibrations in YAML or XML, one file or a folder of them: of OpenCV, ROS or kalibr, distinguished by content."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from nerif.common.conventions import InputError
+from nerif.common.files import ending
+from nerif.imaging.calibration.cameras_file import CalibratedCamera
+from nerif.imaging.calibration.importers.kalibr import is_kalibr, read_kalibr
+from nerif.imaging.calibration.importers.opencv import read_opencv, read_storage
+from nerif.imaging.calibration.importers.ros import is_ros, read_ros
+
+__all__ = ["ENDINGS", "read_yaml_files"]
+
+ENDINGS = (".yml", ".yaml", ".xml")
+PROGRAMS = {"ROS": (read_ros, 1000.0), "kalibr": (read_kalibr, 1000.0), "OpenCV": (read_opencv, 1.0)}
+"""Reader of each program, and the unit of its lengths in mm: ROS and kalibr define metres, OpenCV none."""
+
+
+def read_yaml_files(path: Path, say: Callable[[str], None]) -> tuple[list[CalibratedCamera], float]:
+    """Return the cameras of a file or folder, and its unit of length in mm.
+
+    Parameters
+    ----------
+    say : called with a line about the two files of a stereo pair, which are read together
+    """
+    files, inside = [path], path.is_dir()
+    if inside:
+        files = _files(path)
+    if not files:
+        raise InputError(f"expected calibrations ({' '.join(ENDINGS)}), got none", field=path)
+    contents = {file: _content(file) for file in files}
+    programs = {program: file for file, (program, _) in contents.items()}
+    if len(programs) > 1:
+        names = " and ".join(f"{file.name} of {program}" for program, file in programs.items())
+        raise InputError(f"expected files of one program, got {names}; give one of the files", field=path)
+    (program,) = programs
+    reader, unit = PROGRAMS[program]
+
+    def beside() -> dict[Path, dict[str, Any]]:
+        """The other files of the program in the folder of a single file."""
+        others = {}
+        for file in [] if inside else _files(path.parent):
+            try:
+                of, values = _content(file)
+            except InputError:
+                continue
+            if of == program and file.name != path.name:
+                others[file] = values
+        return others
+
+    return reader({file: values for file, (_, values) in contents.items()}, beside, say), unit
+
+
+def _files(folder: Path) -> list[Path]:
+    return sorted(p for p in folder.iterdir() if ending(p) in ENDINGS and p.is_file() and not p.name.startswith("."))
+
+
+def _content(file: Path) -> tuple[str, dict[str, Any]]:
+    """Return program and entries of a file."""
+    values = {} if ending(file) == ".xml" else _plain_yaml(file)
+    if is_kalibr(values):
+        return "kalibr", values
+    if is_ros(values):
+        return "ROS", values
+    return "OpenCV", read_storage(file)
+
+
+def _plain_yaml(file: Path) -> dict[str, Any]:
+    """Return the entries of YAML without OpenCV's own types; empty for anything else."""
+    import yaml
+
+    try:
+        values = yaml.safe_load(file.read_bytes())
+    except (yaml.YAMLError, UnicodeDecodeError, ValueError):
+        return {}
+    return {str(key): value for key, value in values.items()} if isinstance(values, dict) else {}
