@@ -384,11 +384,11 @@ def test_missing_and_impossible_images_are_refused(taken, balls):
 
 
 def test_the_projector_of_images_is_linear_about_the_displacements(balls, both):
-    """The field predicts the difference of the images to the noise; by default displacements are the data."""
+    """The field explains the difference of the images; by default displacements are the data."""
     grid = Grid.of_resolution(BOX, 30)
     assert Projector(both, grid).channels == ("u", "v")
     a = Projector(both, grid, source="images")
     assert a.channels == ("flow",)
-    residual = ((a.data - a(a.coefficients(balls.sample(grid)))) / a.sigma)[a.mask]
-    assert float(residual.square().mean().sqrt()) == pytest.approx(1.0, abs=0.15)
-    assert float((a.data / a.sigma)[a.mask].square().mean().sqrt()) > 3
+    residual = a.data - a(a.coefficients(balls.sample(grid)))
+    assert float(residual.norm() / a.data.norm()) < 0.1
+    assert float((residual / a.sigma)[a.mask].abs().median()) < 1.2
