@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
-from nerif.cli.commands.info import is_measurement
 from nerif.common.conventions import InputError
+from nerif.data.kinds import VOLUME, kind_of
 from nerif.imaging.readers.views import View, find_views
 from nerif.results.directory import LIVE, RUN
 
@@ -148,10 +148,9 @@ class Project:
             return "results" if _is_result(path) else "experiments" if _has_views(path) else ""
         if path.suffix == ".toml":
             return "calibrations" if self.from_cache(self.relative(path), "kind", _is_calibration) else ""
-        if path.suffix == ".nc" and path.name != "reprojection.nc":
-            measured = self.from_cache(self.relative(path), "kind", is_measurement)
-            if measured:
-                return "measurements"
+        named = path.suffix == ".nc" and path.name != "reprojection.nc"
+        if named and self.from_cache(self.relative(path), "kind", kind_of) is not VOLUME:
+            return "measurements"
         return "volumes" if path.suffix in (".nc", ".vti") and not _is_result(path.parent) else ""
 
 

@@ -15,6 +15,7 @@ from torch import Tensor
 from nerif.common.conventions import DEFAULT_AMBIENT_FACES, InputError, ambient_index, parse_faces, unit_shown
 from nerif.common.files import atomic
 from nerif.common.netcdf import opened
+from nerif.data.kinds import MEASUREMENT, reading_as
 from nerif.forward.base import ForwardModel
 from nerif.forward.registry import TECHNIQUES, forward_model
 from nerif.geometry import Box, Camera, Rays
@@ -480,7 +481,7 @@ class Measurement:
         """Read a measurement file."""
         from nerif.data.measurement_file import CONVENTIONS
 
-        with opened(path, f"a measurement (NetCDF-4, {CONVENTIONS})") as dataset:
+        with reading_as(path, MEASUREMENT), opened(path, f"a measurement (NetCDF-4, {CONVENTIONS})") as dataset:
             return cls.from_dataset(dataset)
 
     def to_dataset(self) -> xr.Dataset:

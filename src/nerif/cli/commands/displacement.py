@@ -72,6 +72,8 @@ class Displacement(Settings):
         """Return images, cameras and box."""
         from nerif.imaging.calibration.importers.importers import import_box, import_cameras
 
+        views = find_views(self.folder, self.views)
+        cameras = {c.name: c for c in import_cameras(self.calibration)}
         box = Box.between(self.lower, self.upper) or import_box(self.calibration)
         if box is None:
             raise InputError(
@@ -81,8 +83,6 @@ class Displacement(Settings):
             )
         scene = Scene(box, self.surroundings)
         masks = MaskSettings(self.mask) if self.mask else None
-        views = find_views(self.folder, self.views)
-        cameras = {c.name: c for c in import_cameras(self.calibration)}
         return Recording(views, cameras, scene, self.method, masks, self.references, self.images)
 
 

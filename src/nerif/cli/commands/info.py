@@ -14,17 +14,15 @@ from torch import Tensor
 from nerif.analysis.evaluation import rms_with_unit
 from nerif.cli.commands.output import say
 from nerif.cli.commands.settings import Settings, command
-from nerif.common.conventions import InputError, with_unit
-from nerif.common.netcdf import opened
+from nerif.common.conventions import with_unit
+from nerif.data.kinds import MEASUREMENT, RESULT, VOLUME, check_kind, kind_of
 from nerif.data.measurement import Measurement
-from nerif.data.measurement_file import known_conventions
 from nerif.data.volume import INDEX, Volume, name_of
 from nerif.data.volume_file import read_volume
-from nerif.forward.registry import TECHNIQUES
 from nerif.plotting.notebook import number
 from nerif.results.directory import METRICS, ResultDirectory
 
-__all__ = ["Info", "is_measurement", "main", "run"]
+__all__ = ["Info", "main", "run"]
 
 
 @dataclass(frozen=True)
@@ -38,23 +36,13 @@ class Info(Settings):
 def run(settings: Info) -> None:
     """Print the description."""
     path = settings.path
+    check_kind(path, MEASUREMENT, VOLUME, RESULT)
     if path.is_dir():
         _result(path)
-    elif path.suffix == ".vti" or (path.suffix == ".nc" and path.is_file() and not is_measurement(path)):
+    elif kind_of(path) is VOLUME:
         _volume(path, read_volume(path))
     else:
         _measurement(path, Measurement.read(path))
-
-
-def is_measurement(path: Path) -> bool:
-    """Return whether a NetCDF file is a measurement rather than a volume, by conventions, variables or coordinates."""
-    try:
-        with opened(path, "a measurement or a volume") as dataset:
-            maps = any(kind.measured in dataset for kind in TECHNIQUES.values())
-            volume = {"x", "y", "z"} <= set(dataset.coords)
-            return known_conventions(dataset.attrs.get("Conventions")) or maps or not volume
-    except InputError:
-        return True
 
 
 def _corners(lower: tuple[float, ...], upper: tuple[float, ...]) -> str:

@@ -15,16 +15,14 @@ import numpy as np
 from jaxtyping import Bool
 
 from nerif.common.conventions import InputError
+from nerif.common.image_names import FOLDER_SUFFIXES, SINGLE_SUFFIXES, SUFFIXES
 from nerif.imaging.readers.array_files import ArrayFrames, Hdf5Frames
 from nerif.imaging.readers.frames import Frames, SelectedFrames, size_in_words
 from nerif.imaging.readers.image_files import FileFrames
 from nerif.imaging.readers.photron import PhotronFrames
 
-__all__ = ["FOLDER_SUFFIXES", "open_frames", "read_mask"]
+__all__ = ["open_frames", "read_mask"]
 
-FOLDER_SUFFIXES = (".tif", ".tiff", ".png", ".bmp", ".jpg", ".jpeg", ".im7")
-SINGLE_SUFFIXES = (".cih", ".cihx", ".mraw", ".npy", ".npz", ".h5", ".hdf5", ".hdf")
-SUFFIXES = (*FOLDER_SUFFIXES, ".vc7", *SINGLE_SUFFIXES)
 SELECTION = re.compile(r"(.+)\[(-?\d+|-?\d*:-?\d*(?::-?\d*)?)\]")
 DATASET = re.compile(r"(.+\.(?:h5|hdf5|hdf|npz)):(.+)", re.IGNORECASE)
 

@@ -17,6 +17,7 @@ from annotated_types import Ge, Lt
 
 from nerif.common.conventions import InputError
 from nerif.common.settings import Positive, check_settings
+from nerif.data.kinds import ARRAYS, CALIBRATION, IMAGES, reading_as
 from nerif.geometry import Box, Lens, Plane
 from nerif.geometry.camera import POWERS
 from nerif.imaging.calibration.cameras_file import CalibratedCamera, check_camera, check_names, read_box
@@ -99,16 +100,8 @@ def import_cameras(
     only : names of the cameras to read; all if empty
     """
     path = Path(path)
-    if not path.exists():
-        raise InputError(f"no such file; expected a calibration ({' '.join(ENDINGS)})", field=path)
-    if path.is_dir():
-        cameras = read_opencv_folder(path)
-    elif path.suffix == ".mat":
-        cameras = read_matlab(path, settings.pose)
-    elif path.suffix in READERS:
-        cameras = READERS[path.suffix](path)
-    else:
-        raise InputError(f"expected a calibration ending in {' '.join(ENDINGS)}, got '{path.suffix}'", field=path)
+    with reading_as(path, CALIBRATION, ignore=(ARRAYS, IMAGES)):
+        cameras = _read(path, settings)
     if not cameras:
         raise InputError("holds no camera", field=path)
     check_names(cameras, str(path))
@@ -117,6 +110,18 @@ def import_cameras(
         if name not in names:
             raise InputError(f"expected some of {', '.join(names)}, got '{name}'", field="views")
     return tuple(check_camera(_completed(c, settings), str(path)) for c in cameras if not only or c.name in only)
+
+
+def _read(path: Path, settings: ImportSettings) -> Sequence[CalibratedCamera]:
+    if not path.exists():
+        raise InputError(f"no such file; expected a calibration ({' '.join(ENDINGS)})", field=path)
+    if path.is_dir():
+        return read_opencv_folder(path)
+    if path.suffix == ".mat":
+        return read_matlab(path, settings.pose)
+    if path.suffix in READERS:
+        return READERS[path.suffix](path)
+    raise InputError(f"expected a calibration ending in {' '.join(ENDINGS)}, got '{path.suffix}'", field=path)
 
 
 def import_box(path: Path, settings: ImportSettings = ImportSettings()) -> Box | None:
