@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerif.common.axis_order import order_remedy
 from nerif.common.conventions import InputError, Points, Values, Vectors, parse_faces
 from nerif.fields.base import Field
 from nerif.geometry import Grid
@@ -51,7 +52,9 @@ class VoxelField(Field):
     def through(cls, values: Float[Tensor, "z y x"], grid: Grid) -> VoxelField:
         """Return the cubic spline that passes through `values` at the voxel centres, mirrored about the outermost."""
         if tuple(values.shape) != grid.shape:
-            raise InputError(f"expected the shape {grid.shape} (z, y, x), got {tuple(values.shape)}", field="volume")
+            remedy = order_remedy("volume", "zyx", grid.shape, values.shape)
+            got = tuple(values.shape)
+            raise InputError(f"expected the shape {grid.shape} (z, y, x), got {got}{remedy}", field="volume")
         coefficients = values.to(torch.float64)
         for axis, n in enumerate(values.shape):
             unit = torch.eye(n, dtype=torch.float64, device=values.device)

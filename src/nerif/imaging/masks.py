@@ -14,6 +14,7 @@ from jaxtyping import Bool, Shaped
 
 from nerif.common.conventions import InputError, unit_shown
 from nerif.common.files import atomic
+from nerif.common.image_names import FOLDER_SUFFIXES
 from nerif.common.settings import NonNegative, Positive, check_settings
 from nerif.data.measurement import Measurement, Observation, integrals_of
 from nerif.imaging.readers.frames import as_float

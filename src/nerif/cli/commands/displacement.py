@@ -123,13 +123,13 @@ def _run_over_time(settings: Displacement, recording: Recording) -> MeasurementS
 
 
 def _print(measurement: Measurement, noise: Mapping[str, str]) -> None:
+    say("valid: pixels with a displacement that correlates, within --max-sigma")
     say(f"{'view':<12}{'valid':>8}{'rms d [px]':>12}{'max |d| [px]':>14}{'sigma [px]':>12}  noise from")
     assert measurement.sigma is not None
     (deflection,) = (o for o in measurement.observations if o.technique is Deflection)
     usable = measurement.usable_for(deflection)
-    for i, (name, camera) in enumerate(zip(measurement.names, measurement.cameras, strict=True)):
+    for i, (name, share) in enumerate(zip(measurement.names, measurement.valid_share(deflection), strict=True)):
         d, sigma = measurement.displacements[i][usable[i]], measurement.sigma[i][usable[i]]
-        share = len(d) / (camera.image_size[0] * camera.image_size[1])
         say(
             f"{name:<12}{share:>8.1%}{float(d.square().mean().sqrt()):>12.3f}"
             f"{float(d.norm(dim=-1).max()):>14.3f}{float(sigma.median()):>12.4f}  {noise[name]}"

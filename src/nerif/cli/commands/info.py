@@ -17,6 +17,7 @@ from nerif.cli.commands.settings import Settings, command
 from nerif.common.conventions import with_unit
 from nerif.data.kinds import MEASUREMENT, RESULT, VOLUME, check_kind, kind_of
 from nerif.data.measurement import Measurement
+from nerif.data.measurement_summary import valid_pixels
 from nerif.data.volume import INDEX, Volume, name_of
 from nerif.data.volume_file import read_volume
 from nerif.plotting.notebook import number
@@ -79,18 +80,19 @@ def _measurement(path: Path, m: Measurement) -> None:
         turn, shift = (float(torch.stack(sigmas)[:, part].square().mean().sqrt()) for part in (slice(3), slice(3, 6)))
         say(f"  pose_sigma     {math.degrees(turn):.2g} deg, {shift:.2g} mm (for --refine cameras)")
     say(f"  flow mask      {'yes' if m.flow_mask is not None else 'no'}")
-    columns = "".join(f"{f'rms {o.label}':>24}" for o in m.observations)
-    say(f"  view            size [px]  pixel [mm]   centre to camera [mm]   to background [mm]   usable{columns}")
-    usable, masks = m.usable, [m.usable_for(o) for o in m.observations]
+    say(f"  valid pixels   {valid_pixels(m)}")
+    columns = "".join(f"{f'valid {o.technique.data_name()}':>20}{f'rms {o.label}':>24}" for o in m.observations)
+    say(f"  view            size [px]  pixel [mm]   centre to camera [mm]   to background [mm]{columns}")
+    masks, shares = [m.usable_for(o) for o in m.observations], [m.valid_share(o) for o in m.observations]
     for i, c in enumerate(m.cameras):
         centre = c.centre.new_tensor(m.box.centre)
         distance, pixel, plane = float(c.distance(centre)), float(c.pixel_size(centre)), c.background
         behind = "none" if plane is None else f"{abs(float(centre @ plane.normal.to(centre)) - plane.offset):.1f}"
         data = [o.values[i][mask[i]] for o, mask in zip(m.observations, masks, strict=True)]
-        rms = "".join(f"{float(x.square().mean().sqrt()) if len(x) else math.nan:24.4f}" for x in data)
-        share = float(usable[i, : c.image_size[0], : c.image_size[1]].float().mean())
+        rms = (float(x.square().mean().sqrt()) if len(x) else math.nan for x in data)
+        columns = "".join(f"{valid[i]:20.1%}{size:24.4f}" for valid, size in zip(shares, rms, strict=True))
         size = f"{c.image_size[0]} x {c.image_size[1]}"
-        say(f"  {c.name:<14} {size:>10} {pixel:11.4g} {distance:23.1f} {behind:>20} {share:8.1%}{rms}")
+        say(f"  {c.name:<14} {size:>10} {pixel:11.4g} {distance:23.1f} {behind:>20}{columns}")
 
 
 def _volume(path: Path, v: Volume) -> None:

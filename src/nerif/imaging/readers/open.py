@@ -59,8 +59,10 @@ def read_mask(path: Path, shape: tuple[int, int]) -> Bool[np.ndarray, "row colum
         stored = frames[0]
     image = stored.astype(np.uint8) if stored.dtype == bool else frames[0]
     if image.shape != shape:
+        turned = "; rows and columns swapped? Rotate or transpose it" if image.shape == shape[::-1] else ""
         raise InputError(
-            f"expected a mask of {size_in_words(shape)} as the view, got {size_in_words(image.shape)}", field=path
+            f"expected a mask of {size_in_words(shape)} as the view, got {size_in_words(image.shape)}{turned}",
+            field=path,
         )
     low, high = float(image.min()), float(image.max())
     if low == high:
