@@ -157,7 +157,7 @@ class Projector:
         """Images of the values of rays by technique, 0 elsewhere."""
         images = torch.zeros(self.range_shape, dtype=self.dtype, device=self.device)
         for pixels, channels, values in zip(self._pixels, self._channels, parts, strict=True):
-            images[(*pixels, channels)] = values.to(self.device, self.dtype)
+            images[..., channels][pixels] = values.to(self.device, self.dtype)
         return images
 
     def _tensor(self, value: Any, shape: tuple[int, ...], name: str, axes: tuple[str, ...]) -> Tensor:

@@ -273,10 +273,10 @@ class ResultDirectory:
         views : False to read only what a verdict needs, which is faster: settings, metrics, and the volumes if they
             have standard deviations
         """
-        check_kind(self.path, RESULT)
-        if not self.path.is_dir():
-            raise InputError("no such directory; expected one written by nerif reconstruct", field=self.path)
         if not any((self.path / name).exists() for name in (*FILES, LIVE) if name != REPORT):
+            check_kind(self.path, RESULT)
+            if not self.path.is_dir():
+                raise InputError("no such directory; expected one written by nerif reconstruct", field=self.path)
             names = ", ".join((RUN, METRICS, HISTORY, VOLUME, REPROJECTION))
             raise InputError(f"expected a result of nerif reconstruct, got none of {names} in it", field=self.path)
         finished = self.has(FIELD)

@@ -17,6 +17,7 @@ from nerif.common.interruption import if_interrupted
 from nerif.common.settings import Count, NonNegative
 from nerif.data.measurement import Measurement
 from nerif.data.measurement_sequence import MeasurementSequence
+from nerif.data.measurement_summary import valid_pixels
 from nerif.forward.deflection import Deflection
 from nerif.geometry import Box
 from nerif.imaging.displacement.displacement import DisplacementSettings
@@ -123,7 +124,6 @@ def _run_over_time(settings: Displacement, recording: Recording) -> MeasurementS
 
 
 def _print(measurement: Measurement, noise: Mapping[str, str]) -> None:
-    say("valid: pixels with a displacement that correlates, within --max-sigma")
     say(f"{'view':<12}{'valid':>8}{'rms d [px]':>12}{'max |d| [px]':>14}{'sigma [px]':>12}  noise from")
     assert measurement.sigma is not None
     (deflection,) = (o for o in measurement.observations if o.technique is Deflection)
@@ -134,6 +134,7 @@ def _print(measurement: Measurement, noise: Mapping[str, str]) -> None:
             f"{name:<12}{share:>8.1%}{float(d.square().mean().sqrt()):>12.3f}"
             f"{float(d.norm(dim=-1).max()):>14.3f}{float(sigma.median()):>12.4f}  {noise[name]}"
         )
+    say(f"valid pixels: {valid_pixels(measurement)}")
 
 
 main = command("displacement", Displacement, run)

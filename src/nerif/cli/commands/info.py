@@ -89,10 +89,10 @@ def _measurement(path: Path, m: Measurement) -> None:
         distance, pixel, plane = float(c.distance(centre)), float(c.pixel_size(centre)), c.background
         behind = "none" if plane is None else f"{abs(float(centre @ plane.normal.to(centre)) - plane.offset):.1f}"
         data = [o.values[i][mask[i]] for o, mask in zip(m.observations, masks, strict=True)]
-        rms = (float(x.square().mean().sqrt()) if len(x) else math.nan for x in data)
-        columns = "".join(f"{valid[i]:20.1%}{size:24.4f}" for valid, size in zip(shares, rms, strict=True))
+        sizes = (float(x.square().mean().sqrt()) if len(x) else math.nan for x in data)
+        cells = "".join(f"{valid[i]:20.1%}{size:24.4f}" for valid, size in zip(shares, sizes, strict=True))
         size = f"{c.image_size[0]} x {c.image_size[1]}"
-        say(f"  {c.name:<14} {size:>10} {pixel:11.4g} {distance:23.1f} {behind:>20}{columns}")
+        say(f"  {c.name:<14} {size:>10} {pixel:11.4g} {distance:23.1f} {behind:>20}{cells}")
 
 
 def _volume(path: Path, v: Volume) -> None:
