@@ -1,6 +1,6 @@
 """Kinds of files and folders: how each is recognised, and the command that takes it.
 
-Whoever opens one of them does so within `reading_as`, so that another kind is named with its command.
+Readers open them within `reading_as`: the error for a file of another kind names that kind and its command.
 """
 
 from __future__ import annotations
@@ -106,7 +106,7 @@ def check_kind(path: str | os.PathLike[str], *wanted: Kind, ignore: tuple[Kind, 
 
 @contextmanager
 def reading_as(path: str | os.PathLike[str], *wanted: Kind, ignore: tuple[Kind, ...] = ()) -> Iterator[None]:
-    """Read a file or folder; where that fails since it is of another kind, the InputError says so."""
+    """Read a file or folder; if that fails and it is of another kind, raise the error of `check_kind` instead."""
     try:
         yield
     except InputError:
