@@ -122,7 +122,7 @@ class Projector:
 
     def volume(self, x: Float[Tensor, "z y x"]) -> Volume:
         """Return the values of a volume x at the voxel centres, as nerif.export writes them."""
-        values = self.field(x.detach()).sample(self.grid, self.device)
+        values = self.field(x).sample(self.grid, self.device)
         return Volume.of(values, self.grid, self.measurement.quantity, self.measurement.n_ambient)
 
     def coefficients(self, values: Float[Tensor, "z y x"]) -> Float[Tensor, "z y x"]:
