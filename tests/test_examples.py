@@ -15,6 +15,7 @@ import torch
 from line_scans import LineScan
 
 from nerif.data.measurement import Measurement
+from nerif.data.volume_file import read_volume
 from nerif.geometry import Grid
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from refusals import refused
@@ -33,6 +34,15 @@ def test_own_data(tmp_path, monkeypatch):
     # from further left, p0 < p, and d = p - p0 > 0 there
     left_half = m.displacement[0, 60, :99, 0]
     assert float(left_half.mean()) > 0
+
+
+def test_own_algorithm(tmp_path, monkeypatch, capsys):
+    """Landweber finds most of the flame, and total variation more of it."""
+    monkeypatch.setattr(sys, "argv", ["own_algorithm.py", "--out", str(tmp_path / "mine.vti")])
+    runpy.run_path(str(EXAMPLES / "own_algorithm.py"), run_name="__main__")
+    first, second = (float(x) for x in re.findall(r"error ([\d.]+)%", capsys.readouterr().out))
+    assert second < 0.9 * first < 25
+    assert read_volume(tmp_path / "mine.vti").grid.shape == (16, 18, 20)
 
 
 def test_particles(tmp_path, monkeypatch, capsys):
@@ -170,6 +180,7 @@ def test_jet(tmp_path):
 def test_examples_are_all_tested():
     tested = {
         "nerif_in_one_page.py",
+        "own_algorithm.py",
         "own_data.py",
         "from_images.py",
         "knocked_camera.py",

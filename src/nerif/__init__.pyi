@@ -26,6 +26,7 @@ from .physics.quantities import derive as derive
 from .reconstruction.base import Reconstruction as Reconstruction
 from .reconstruction.neural.neural import NeRIF as NeRIF
 from .reconstruction.neural.presets import preset as preset
+from .reconstruction.projector import Projector as Projector
 from .reconstruction.voxels.landweber import Landweber as Landweber
 from .reconstruction.voxels.multiplicative import MART as MART
 from .reconstruction.voxels.multiplicative import MLEM as MLEM

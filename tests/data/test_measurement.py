@@ -13,9 +13,10 @@ import xarray as xr
 from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
 from nerif.data.measurement_file import variables
+from nerif.data.volume import Volume
 from nerif.forward.deflection import Deflection
 from nerif.forward.registry import TECHNIQUES
-from nerif.geometry import Lens, Ring
+from nerif.geometry import Grid, Lens, Ring
 from nerif.simulation.simulate import simulate
 from refusals import refused
 
@@ -118,6 +119,61 @@ def test_impossible_sigma_and_displacement_are_left_out(full):
     assert not bool(m.usable[0, 1, 1:4].any())
     with refused("displacement of view '0deg'"):
         replace(full, sigma=torch.full_like(sigma, 1e-30))
+
+
+@pytest.mark.parametrize(
+    ("order", "remedy"),
+    [
+        ((0, 2, 1, 3), "row and column swapped? Transpose the array: np.swapaxes(displacement, 1, 2)"),
+        ((0, 3, 1, 2), "axes in another order? Transpose the array: np.transpose(displacement, (0, 2, 3, 1))"),
+        ((1, 2, 3, 0), "axes in another order? Transpose the array: np.transpose(displacement, (3, 0, 1, 2))"),
+    ],
+)
+@pytest.mark.usefixtures("unchecked")
+def test_swapped_axes_are_named_and_the_remedy_undoes_them(measurement, order, remedy):
+    d = measurement.displacement
+    swapped = d.permute(order)
+    with refused("displacement") as error:
+        replace(measurement, displacement=swapped)
+    assert str(error.value).endswith(f"; {remedy}")
+    back = eval(remedy.partition("array: ")[2], {"np": np, "displacement": swapped.numpy()})
+    assert np.array_equal(back, d.numpy(), equal_nan=True)
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_swapped_masks_volumes_and_padded_maps_are_named(measurement, tmp_path):
+    views, rows, columns = measurement.shape
+    with refused("valid") as error:
+        replace(measurement, valid=torch.ones(views, columns, rows, dtype=torch.bool))
+    assert "np.swapaxes(valid, 1, 2)" in str(error.value)
+    padded = torch.nn.functional.pad(measurement.displacement.swapaxes(1, 2), (0, 0, 0, 0, 0, 3))
+    with refused(f"image_size of view '{measurement.names[0]}'") as error:
+        replace(measurement, displacement=padded, sigma=None)
+    assert "are rows and columns of the maps swapped?" in str(error.value)
+    with refused("volume 'index_excess'") as error:
+        Volume(torch.zeros(5, 4, 3), Grid(measurement.box, (3, 4, 5)))
+    assert "z and x swapped?" in str(error.value)
+    dataset = measurement.to_dataset()
+    names = {"row": "column", "column": "row"}
+    turned = dataset.drop_vars(["displacement", "sigma"])
+    turned = turned.assign({name: dataset[name].rename(names) for name in ("displacement", "sigma")})
+    turned.to_netcdf(tmp_path / "turned.nc", engine="h5netcdf")
+    with refused("displacement") as error:
+        Measurement.read(tmp_path / "turned.nc")
+    assert str(error.value).startswith(f"{tmp_path / 'turned.nc'}: displacement: expected (view, row, column")
+
+
+def test_valid_pixels_are_counted_for_each_technique(measurement):
+    """Of their images, padding excluded; named where there are several techniques."""
+    d = measurement.displacement.clone()
+    d[0, :, :13] = torch.nan
+    half = replace(measurement, displacement=d)
+    (o,) = half.observations
+    assert half.valid_share(o) == [0.5, 1.0, 1.0, 1.0, 1.0]
+    assert dict(half.summary())["Valid pixels"] == "90.0%"
+    fringes = torch.ones(half.shape)
+    both = replace(half, maps={"fringes": fringes, "fringes_sigma": fringes}, wavelength_nm=532.0)
+    assert dict(both.summary())["Valid pixels"] == "90.0% (displacement), 100.0% (fringes)"
 
 
 @pytest.mark.parametrize("distortion", [0.0, -0.1])

@@ -27,6 +27,7 @@ from nerif.geometry import Box, Grid, Ring
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.neural.trainer import Trainer
 from nerif.reconstruction.neural.training_data import TrainingData
+from nerif.reconstruction.projector import Projector
 from nerif.reconstruction.sources import of_source, stages
 from nerif.reconstruction.target import Target
 from nerif.reconstruction.voxels.operator import VoxelOperator
@@ -380,3 +381,14 @@ def test_missing_and_impossible_images_are_refused(taken, balls):
     for field, make in cases:
         with refused(field):
             make()
+
+
+def test_the_projector_of_images_is_linear_about_the_displacements(balls, both):
+    """The field explains the difference of the images; by default displacements are the data."""
+    grid = Grid.of_resolution(BOX, 30)
+    assert Projector(both, grid).channels == ("u", "v")
+    a = Projector(both, grid, source="images")
+    assert a.channels == ("flow",)
+    residual = a.data - a(a.coefficients(balls.sample(grid)))
+    assert float(residual.norm() / a.data.norm()) < 0.1
+    assert float((residual / a.sigma)[a.mask].abs().median()) < 1.2

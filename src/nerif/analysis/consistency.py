@@ -162,8 +162,7 @@ def _check_technique(
         return Consistency((), (), ("no view looks at the box: nothing to compare",))
     measurement = measurement.select(names)
     small = uncorrected = without_spikes(binned(measurement, MAX_PIXELS))
-    pixels = measurement.usable.flatten(1).sum(dim=1).tolist()
-    valid = [n / (c.image_size[0] * c.image_size[1]) for n, c in zip(pixels, measurement.cameras, strict=True)]
+    valid = measurement.valid_share(measurement.observations[0])
     remarks = image_remarks(measurement, small, valid)
     if len(names) < 3:
         return Consistency((), (), (*remarks, "fewer than three views: they cannot be compared"))
@@ -277,7 +276,7 @@ def image_remarks(measurement: Measurement, small: Measurement, valid: Sequence[
     remarks, kind = [], measurement.observations[0].technique
     for i, name in enumerate(measurement.names):
         if valid[i] < 0.5:
-            remarks.append(f"view {name}: only {valid[i]:.0%} of its pixels are valid")
+            remarks.append(f"view {name}: only {valid[i]:.0%} valid pixels ({kind.data_name()})")
         rows, columns = small.cameras[i].image_size
         d = _values(small)[i, :rows, :columns]
         finite = torch.isfinite(d).all(dim=-1)

@@ -21,7 +21,7 @@ from nerif.fields.grid import VoxelField
 from nerif.fields.network import NeuralField
 from nerif.fields.symmetric import SymmetricVoxels, symmetry_of_field
 from nerif.forward.base import ForwardModel
-from nerif.forward.path_integral import LENS_RAYS, PathIntegral, Projector, project
+from nerif.forward.path_integral import LENS_RAYS, FieldProjector, PathIntegral, project
 from nerif.forward.ray_tracing import CurvedRays
 from nerif.forward.registry import ASSUMED, AUTO, TECHNIQUES, check_simulated, forward_model, forward_models
 from nerif.geometry import Box, Camera, Grid, Rays
@@ -58,7 +58,7 @@ def check_sees(techniques: Sequence[type[ForwardModel]], quantity: str, what: st
 
 
 def predict_view(
-    field: Field, camera: Camera, projector: Projector, box: Box, device: torch.device | str = "cpu"
+    field: Field, camera: Camera, projector: FieldProjector, box: Box, device: torch.device | str = "cpu"
 ) -> Float[Tensor, "row column c"]:
     """Return the view of a field; 0 where a ray misses the box."""
     rays = camera.rays(camera.pixel_grid().reshape(-1, 2)).clip(box).to(dtype=torch.float32)
@@ -120,7 +120,7 @@ def predict(
     shape = (len(cameras), *(max(c.image_size[i] for c in cameras) for i in (0, 1)), len(technique.channels))
     cameras, empty = tuple(technique.seen_by(c) for c in cameras), torch.zeros(shape)
     measurement = measurement_of({technique: empty}, cameras, box, n_ambient, wavelength_nm)
-    projector: Projector
+    projector: FieldProjector
     if model == TRACED and technique.traced:
         projector = CurvedRays(samples, n_ambient)
     else:

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
-from nerif.cli.commands.info import is_measurement
 from nerif.common.conventions import InputError
 from nerif.common.files import ending
+from nerif.data.kinds import VOLUME, kind_of
 from nerif.imaging.readers.views import View, find_views
 from nerif.results.directory import LIVE, RUN
 
@@ -149,10 +149,9 @@ class Project:
             return "results" if _is_result(path) else "experiments" if _has_views(path) else ""
         if ending(path) == ".toml":
             return "calibrations" if self.from_cache(self.relative(path), "kind", _is_calibration) else ""
-        if ending(path) == ".nc" and path.name != "reprojection.nc":
-            measured = self.from_cache(self.relative(path), "kind", is_measurement)
-            if measured:
-                return "measurements"
+        named = ending(path) == ".nc" and path.name != "reprojection.nc"
+        if named and self.from_cache(self.relative(path), "kind", kind_of) is not VOLUME:
+            return "measurements"
         return "volumes" if ending(path) in (".nc", ".vti") and not _is_result(path.parent) else ""
 
 

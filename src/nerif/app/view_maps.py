@@ -31,8 +31,7 @@ def maps_html(measurement: Measurement) -> str:
     scale = f"Colours from {least:.3g} to {most:.3g} {unit} in all views"
     scale += "; grey: not valid." if sigma is None else f", of sigma from 0 to {noisiest:.3g} {unit}; grey: not valid."
     parts.append(f"<p class=note>{scale}</p>")
-    for i, camera in enumerate(measurement.cameras):
-        height, width = camera.image_size
+    for i, (camera, share) in enumerate(zip(measurement.cameras, measurement.valid_share(observation), strict=True)):
         part = _pixels(i, camera, PIXELS)
         images = {
             name: image_address(values[part][..., c].numpy(), (least, most))
@@ -41,9 +40,9 @@ def maps_html(measurement: Measurement) -> str:
         if sigma is not None:
             images["sigma"] = image_address(sigma[part].numpy(), (0.0, noisiest), "viridis")
         images["valid"] = image_address(usable[part].numpy().astype(float), (0.0, 1.0), "gray")
-        share = float(usable[i, :height, :width].float().mean())
         row = images_html([(address, f"{name} of view {camera.name}", name) for name, address in images.items()])
-        parts.append(f"<h3>{escape(camera.name)}, {share:.1%} valid</h3>{row}")
+        heading = f"{escape(camera.name)}, {share:.1%} valid pixels ({observation.technique.data_name()})"
+        parts.append(f"<h3>{heading}</h3>{row}")
     return "".join(parts)
 
 

@@ -38,7 +38,8 @@ def opened(path: str | os.PathLike[str], expected: str) -> Iterator[xr.Dataset]:
     """
     path = Path(path)
     if not path.is_file():
-        raise InputError(f"no such file; expected {expected}", field=path)
+        what = "a folder" if path.is_dir() else "no such file"
+        raise InputError(f"{what}; expected {expected}", field=path)
     with reading(f"{path}: not a readable NetCDF file, or truncated"):
         dataset = _dataset(path)
     with dataset:

@@ -12,9 +12,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from nerif.common.axis_order import order_remedy
 from nerif.common.conventions import DEFAULT_AMBIENT_FACES, InputError, ambient_index, parse_faces, unit_shown
 from nerif.common.files import atomic
 from nerif.common.netcdf import opened
+from nerif.data.kinds import MEASUREMENT, reading_as
 from nerif.forward.base import ForwardModel
 from nerif.forward.registry import TECHNIQUES, forward_model
 from nerif.geometry import Box, Camera, Rays
@@ -188,20 +190,33 @@ class Measurement:
         first = next((name for name in kinds if name in maps), None)
         if first is None:
             raise InputError(f"expected one of {', '.join(kinds)}, got none", field="measurement")
-        shape = tuple(maps[first].shape[:3])
-        if len(self.cameras) != shape[0] or not self.cameras:
-            raise InputError(f"expected one map per camera ({len(self.cameras)}), got {shape[0]}", field=first)
+        if not self.cameras:
+            raise InputError(f"expected one map per camera, got {len(maps[first])} and no camera", field=first)
         channels = {"valid": 1, "flow_mask": 1}
         for kind in kinds.values():
             channels |= {kind.measured: len(kind.channels), kind.sigma: len(kind.channels)}
             channels |= {name: count for name, (count, _) in kind.beside.items()}
-        for name, value in {**maps, "valid": self.valid, "flow_mask": self.flow_mask}.items():
+        every = {**maps, "valid": self.valid, "flow_mask": self.flow_mask}
+        for name in every:
             if name not in channels:
                 raise InputError(f"expected names out of {', '.join(sorted(channels))}, got '{name}'", field="maps")
-            expected = (*shape, channels[name]) if channels[name] > 1 else shape
-            if value is not None and tuple(value.shape) != expected:
-                axes = "view, row, column" + ", component" * (len(expected) - 3)
-                raise InputError(f"expected ({axes}) = {expected}, got {tuple(value.shape)}", field=name)
+        shapes = {name: tuple(value.shape) for name, value in every.items() if value is not None}
+        sizes = (len(self.cameras), *(max(camera.image_size[i] for camera in self.cameras) for i in (0, 1)))
+        axes = ("view", "row", "column", "component")
+        for name, shape in shapes.items():
+            expected = (*sizes, channels[name])[: 4 if channels[name] > 1 else 3]
+            if remedy := order_remedy(name, axes, expected, shape):
+                raise InputError(
+                    f"expected ({', '.join(axes[: len(expected)])}) = {expected} as the cameras, whose image_size is "
+                    f"(height, width), got {shape}{remedy}",
+                    field=name,
+                )
+        if shapes[first][0] != len(self.cameras):
+            raise InputError(f"expected one map per camera ({len(self.cameras)}), got {shapes[first][0]}", field=first)
+        for name, shape in shapes.items():
+            expected = (*shapes[first][:3], channels[name])[: 4 if channels[name] > 1 else 3]
+            if shape != expected:
+                raise InputError(f"expected ({', '.join(axes[: len(expected)])}) = {expected}, got {shape}", field=name)
 
     def _check_views(self) -> None:
         _, rows, columns = self.shape
@@ -209,10 +224,12 @@ class Measurement:
             raise InputError(f"expected different names, got {', '.join(self.names)}", field="view")
         if len({camera.lens is None for camera in self.cameras}) > 1:
             raise InputError("expected for all views or none (0: thin rays)", field="aperture_diameter")
+        swapped = all(c.image_size[0] <= columns and c.image_size[1] <= rows for c in self.cameras)
         for camera in self.cameras:
             if camera.image_size[0] > rows or camera.image_size[1] > columns:
                 raise InputError(
-                    f"expected at most {(rows, columns)} (height, width) px, got {camera.image_size}",
+                    f"expected at most {(rows, columns)} (height, width) px, the size of the maps, got "
+                    f"{camera.image_size}{'; are rows and columns of the maps swapped?' * swapped}",
                     field=f"image_size of view '{camera.name}'",
                 )
 
@@ -336,6 +353,11 @@ class Measurement:
         for i in range(len(mask)):
             mask[i] &= observation.valid(i)
         return mask
+
+    def valid_share(self, observation: Observation) -> list[float]:
+        """Return for each view the share of the pixels of its image that have valid data of a technique."""
+        counts = self.usable_for(observation).flatten(1).sum(dim=1).tolist()
+        return [n / (c.image_size[0] * c.image_size[1]) for n, c in zip(counts, self.cameras, strict=True)]
 
     @property
     def bad_pixels(self) -> int:
@@ -480,7 +502,7 @@ class Measurement:
         """Read a measurement file."""
         from nerif.data.measurement_file import CONVENTIONS
 
-        with opened(path, f"a measurement (NetCDF-4, {CONVENTIONS})") as dataset:
+        with reading_as(path, MEASUREMENT), opened(path, f"a measurement (NetCDF-4, {CONVENTIONS})") as dataset:
             return cls.from_dataset(dataset)
 
     def to_dataset(self) -> xr.Dataset:

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from nerif.common.conventions import COMPONENTS, DEFAULT_AMBIENT_FACES, InputError, parse_faces, whole
 from nerif.common.netcdf import reading, values
+from nerif.data.kinds import BOST, known_conventions
 from nerif.data.measurement import Measurement
 from nerif.forward.base import ForwardModel
 from nerif.forward.deflection import Deflection
@@ -24,11 +25,10 @@ if TYPE_CHECKING:
     import xarray as xr
 
 __all__ = [
-    "CONVENTIONS", "PLAIN", "encoding", "from_dataset", "known_conventions", "map_names", "to_dataset", "variables",
+    "CONVENTIONS", "PLAIN", "encoding", "from_dataset", "map_names", "to_dataset", "variables",
 ]  # fmt: skip
 
-PLAIN, CONVENTIONS = "BOST-1.0", "BOST-1.1"
-"""Conventions of files with the content of version 1.0, and of files with more."""
+PLAIN, CONVENTIONS = BOST
 
 PIXELS = ("view", "row", "column")
 RIG = {
@@ -75,11 +75,6 @@ def _component(channels: int) -> str:
 def map_names() -> tuple[str, ...]:
     """Return the names of variables with a value per pixel."""
     return tuple(name for name, (dimensions, _) in variables().items() if dimensions[:3] == PIXELS)
-
-
-def known_conventions(conventions: object) -> bool:
-    """Return whether an attribute Conventions is that of a measurement."""
-    return isinstance(conventions, str) and conventions in (PLAIN, CONVENTIONS)
 
 
 def encoding(dataset: xr.Dataset) -> dict[str, dict[str, Any]]:

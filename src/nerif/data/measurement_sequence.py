@@ -18,8 +18,9 @@ from nerif.common.conventions import InputError
 from nerif.common.files import atomic
 from nerif.common.installation import install
 from nerif.common.netcdf import reading, values
+from nerif.data.kinds import SEQUENCE, known_conventions, reading_as
 from nerif.data.measurement import Measurement
-from nerif.data.measurement_file import CONVENTIONS, PLAIN, known_conventions, map_names, variables
+from nerif.data.measurement_file import CONVENTIONS, PLAIN, map_names, variables
 from nerif.forward.registry import TECHNIQUES
 
 if TYPE_CHECKING:
@@ -108,7 +109,11 @@ class MeasurementSequence:
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> MeasurementSequence:
         """Open a store; frames are read on demand."""
-        path = Path(path)
+        with reading_as(path, SEQUENCE):
+            return cls._read(Path(path))
+
+    @classmethod
+    def _read(cls, path: Path) -> MeasurementSequence:
         _check_arrays(path)
         with _opened(path) as dataset:
             conventions = dataset.attrs.get("Conventions")
@@ -259,8 +264,9 @@ def _opened(path: Path) -> xr.Dataset:
     import xarray as xr
 
     require_zarr()
-    if not path.exists():
-        raise InputError(f"no such store; expected a measurement sequence (Zarr, {CONVENTIONS})", field=path)
+    if not (path / "zarr.json").is_file():
+        what = "no zarr.json in it" if path.is_dir() else "no such store"
+        raise InputError(f"{what}; expected a measurement sequence (Zarr, {CONVENTIONS})", field=path)
     with reading(f"{path}: not a readable Zarr store"):
         return xr.open_dataset(
             path, engine="zarr", chunks=None, consolidated=False, decode_times=False, zarr_format=ZARR_FORMAT

@@ -9,14 +9,13 @@ from nerif.data.measurement import Measurement, Observation
 from nerif.forward.deflection import Deflection
 from nerif.plotting.notebook import PIXELS, number, panel, show_views
 
-__all__ = ["as_html", "summary"]
+__all__ = ["as_html", "summary", "valid_pixels"]
 
 
 def summary(measurement: Measurement, withheld: int = 0) -> list[tuple[str, str]]:
     """Return names and values with units; `withheld`: number of views not used."""
     cameras = measurement.cameras
     sizes = sorted({c.image_size for c in cameras})
-    inside = sum(height * width for height, width in (c.image_size for c in cameras))
     unused = f" ({withheld} withheld)" if withheld else ""
     light = f" at {measurement.wavelength_nm:g} nm" if measurement.wavelength_nm else ""
     of_index = measurement.quantity == Deflection.quantity
@@ -24,11 +23,22 @@ def summary(measurement: Measurement, withheld: int = 0) -> list[tuple[str, str]
     return [
         ("Views", f"{len(cameras)}{unused}, {' and '.join(f'{w} × {h}' for h, w in sizes[:3])} px"),
         *(row for observation in measurement.observations for row in _sizes(measurement, observation)),
-        ("Usable pixels", f"{max(int(measurement.usable.sum()), 1) / inside:.1%}"),
+        ("Valid pixels", valid_pixels(measurement)),
         *_lenses(measurement),
         ("Volume", " × ".join(f"{e:g}" for e in measurement.box.edges) + " mm (x, y, z)"),
         *ambient,
     ]
+
+
+def valid_pixels(measurement: Measurement) -> str:
+    """Return the share of valid pixels of all images; of each technique, if there are several."""
+    sizes = torch.tensor([c.image_size for c in measurement.cameras], dtype=torch.float64).prod(dim=1)
+    shares = {
+        o.technique.data_name(): float((torch.tensor(measurement.valid_share(o)) * sizes).sum() / sizes.sum())
+        for o in measurement.observations
+    }
+    several = len(shares) > 1
+    return ", ".join(f"{share:.1%} ({name})" if several else f"{share:.1%}" for name, share in shares.items())
 
 
 def _lenses(measurement: Measurement) -> list[tuple[str, str]]:

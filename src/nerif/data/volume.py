@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from jaxtyping import Float
 from torch import Tensor
 
+from nerif.common.axis_order import order_remedy
 from nerif.common.conventions import STATISTICS, InputError, ambient_index
 from nerif.geometry import Grid
 
@@ -75,8 +76,9 @@ class Volume:
 
     def __post_init__(self) -> None:
         if tuple(self.values.shape) != self.grid.shape:
+            remedy = order_remedy("values", "zyx", self.grid.shape, self.values.shape)
             raise InputError(
-                f"expected values of shape {self.grid.shape} (z, y, x), got {tuple(self.values.shape)}",
+                f"expected values of shape {self.grid.shape} (z, y, x), got {tuple(self.values.shape)}{remedy}",
                 field=f"volume '{self.quantity}'",
             )
 

@@ -14,6 +14,7 @@ from torch import Tensor
 from nerif.common.conventions import LARGEST_INDEX, LARGEST_LENGTH, STATISTICS, InputError
 from nerif.common.files import atomic, ending
 from nerif.common.netcdf import opened, values
+from nerif.data.kinds import VOLUME, reading_as
 from nerif.data.volume import QUANTITIES, Volume, describe, field_of, name_of
 from nerif.data.vti import read_vti
 from nerif.geometry import Box, Grid
@@ -116,8 +117,14 @@ def read_volumes(path: str | os.PathLike[str]) -> dict[str, Volume]:
 
 def _read(path: Path) -> Content:
     """Return the content of a file; attributes of one quantity under density.assumption and the like."""
+    with reading_as(path, VOLUME):
+        return _read_as_ending(path)
+
+
+def _read_as_ending(path: Path) -> Content:
     if not path.is_file():
-        raise InputError("no such file; expected a volume (.nc or .vti)", field=path)
+        what = "a folder" if path.is_dir() else "no such file"
+        raise InputError(f"{what}; expected a volume (.nc or .vti)", field=path)
     if ending(path) == ".nc":
         with opened(path, "a volume (.nc or .vti)") as dataset:
             return _content(dataset)

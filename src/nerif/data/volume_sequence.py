@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from nerif.common.conventions import InputError, ambient_index
 from nerif.common.files import atomic
 from nerif.common.netcdf import reading
+from nerif.data.kinds import SEQUENCE_RESULT, TRUE_SEQUENCE, reading_as
 from nerif.data.measurement_sequence import ZARR_FORMAT, add_frames, check_store, require_zarr
 from nerif.data.volume import Volume, describe, field_of, name_of
 from nerif.data.volume_file import REFERENCES
@@ -56,12 +57,18 @@ class VolumeSequence:
     """A Zarr store of volumes on one grid."""
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
+        self.path = Path(path)
+        with reading_as(path, SEQUENCE_RESULT, TRUE_SEQUENCE):
+            self._open()
+
+    def _open(self) -> None:
         require_zarr()
         import zarr
 
-        self.path = Path(path)
-        if not self.path.is_dir():
-            raise InputError("no such store; expected volumes over time (Zarr)", field=path)
+        path = self.path
+        if not (path / "zarr.json").is_file():
+            what = "no zarr.json in it" if path.is_dir() else "no such store"
+            raise InputError(f"{what}; expected volumes over time (Zarr)", field=path)
         with reading(f"{path}: expected volumes over time, written by nerif"):
             self.group: zarr.Group = zarr.open_group(self.path, mode="r+", zarr_format=ZARR_FORMAT)
             self.attributes: dict[str, Any] = dict(self.group.attrs)

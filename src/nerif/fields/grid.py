@@ -14,11 +14,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerif.common.axis_order import order_remedy
 from nerif.common.conventions import InputError, Points, Values, Vectors, parse_faces
 from nerif.fields.base import Field
 from nerif.geometry import Grid
 
-__all__ = ["DEGREES", "Boundary", "VoxelField", "spline_weights"]
+__all__ = ["DEGREES", "Boundary", "VoxelField", "spline_coefficients", "spline_weights"]
 
 DEGREES = {"linear": 1, "cubic": 3}
 
@@ -51,11 +52,14 @@ class VoxelField(Field):
     def through(cls, values: Float[Tensor, "z y x"], grid: Grid) -> VoxelField:
         """Return the cubic spline that passes through `values` at the voxel centres, mirrored about the outermost."""
         if tuple(values.shape) != grid.shape:
-            raise InputError(f"expected the shape {grid.shape} (z, y, x), got {tuple(values.shape)}", field="volume")
+            remedy = order_remedy("volume", "zyx", grid.shape, values.shape)
+            got = tuple(values.shape)
+            raise InputError(f"expected the shape {grid.shape} (z, y, x), got {got}{remedy}", field="volume")
         coefficients = values.to(torch.float64)
-        for axis in range(3):
-            coefficients = _prefilter(coefficients, axis)
-            coefficients = coefficients.index_select(axis, _mirrored(values.shape[axis], 2).to(values.device))
+        for axis, n in enumerate(values.shape):
+            unit = torch.eye(n, dtype=torch.float64, device=values.device)
+            coefficients = _prefilter(coefficients, axis, unit[_mirrored(n, 1)])
+            coefficients = coefficients.index_select(axis, _mirrored(n, 2).to(values.device))
         return cls(coefficients.to(values.dtype), grid, 3)
 
     def to(self, device: torch.device | str) -> VoxelField:
@@ -158,18 +162,25 @@ def spline_weights(t: Tensor, degree: int) -> tuple[Tensor, Tensor]:
     return weights, slopes
 
 
-def _prefilter(values: Tensor, axis: int) -> Tensor:
-    """Coefficients c of the spline with (c[i-1] + 4 c[i] + c[i+1]) / 6 = values[i], mirrored at the ends."""
-    n = values.shape[axis]
-    if n == 1:
+def spline_coefficients(values: Float[Tensor, "z y x"], degree: int, boundary: Boundary) -> Float[Tensor, "z y x"]:
+    """Return the coefficients within a boundary of the spline with these values at the voxel centres."""
+    if degree == 1:
         return values
+    coefficients = values.to(torch.float64)
+    for axis, n in enumerate(values.shape):
+        unit = torch.eye(n, dtype=torch.float64, device=values.device)[..., None].movedim(0, axis)
+        coefficients = _prefilter(coefficients, axis, boundary.extend(unit, 1, (axis,)).movedim(axis, 0)[..., 0])
+    return coefficients.to(values.dtype)
+
+
+def _prefilter(values: Tensor, axis: int, extended: Float[Tensor, "m n"]) -> Tensor:
+    """Coefficients c of the spline with (c[i-1] + 4 c[i] + c[i+1]) / 6 = values[i].
+
+    `extended` has a row for each of c[-1] ... c[n], a function of the n inner ones.
+    """
     first = values.movedim(axis, 0)
-    matrix = torch.zeros(n, n, dtype=values.dtype, device=values.device)
-    matrix.diagonal().fill_(4 / 6)
-    matrix.diagonal(1).fill_(1 / 6)
-    matrix.diagonal(-1).fill_(1 / 6)
-    matrix[0, 1] = matrix[-1, -2] = 2 / 6
-    return torch.linalg.solve(matrix, first.reshape(n, -1)).reshape(first.shape).movedim(0, axis)
+    matrix = (extended[:-2] + 4 * extended[1:-1] + extended[2:]) / 6
+    return torch.linalg.solve(matrix, first.reshape(len(first), -1)).reshape(first.shape).movedim(0, axis)
 
 
 def _mirrored(n: int, layers: int) -> Tensor:

@@ -138,6 +138,11 @@ class ForwardModel(ABC):
         """Return the weights of samples at path lengths s, each for a length `step`, mm."""
 
     @classmethod
+    def data_name(cls) -> str:
+        """Return the name of the data as printed: the measured quantity, or images."""
+        return cls.name if cls.derived else cls.measured
+
+    @classmethod
     def in_pixels(cls) -> bool:
         """Return whether values are lengths in the image."""
         return cls.unit == "px"

@@ -17,13 +17,13 @@ from nerif.fields.base import Field
 from nerif.forward.base import ForwardModel, midpoints
 from nerif.geometry import Rays
 
-__all__ = ["LENS_RAYS", "PathIntegral", "Projector", "places", "project"]
+__all__ = ["LENS_RAYS", "FieldProjector", "PathIntegral", "places", "project"]
 
 LENS_RAYS = 16  # through the lens of a pixel, each with half as many samples as a thin ray
 CHUNK_RAYS = {"cpu": 32, "cuda": 4096}  # arrays that stay in the cache of a CPU, and fill a GPU
 
 
-class Projector(ABC):
+class FieldProjector(ABC):
     """The projections of a field along rays that are clipped to the box."""
 
     channels: int  # components of the measured quantity
@@ -33,7 +33,7 @@ class Projector(ABC):
 
 
 @dataclass(frozen=True)
-class PathIntegral(Projector):
+class PathIntegral(FieldProjector):
     """The integral of a forward model by midpoints of equal intervals; through a lens the mean over its rays."""
 
     model: ForwardModel
@@ -84,7 +84,7 @@ def places(
 
 @torch.no_grad()
 def project(
-    projector: Projector, field: Field, rays: Rays, device: torch.device | str = "cpu", chunk: int | None = None
+    projector: FieldProjector, field: Field, rays: Rays, device: torch.device | str = "cpu", chunk: int | None = None
 ) -> Float[Tensor, "n c"]:
     """Return the projections of a field along many rays, in chunks, on the device of the rays; 0 outside the box."""
     chunk = chunk or CHUNK_RAYS["cpu" if torch.device(device).type == "cpu" else "cuda"]

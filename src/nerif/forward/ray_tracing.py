@@ -22,7 +22,7 @@ from torch import Tensor
 from nerif.common.conventions import InputError
 from nerif.common.pauses import pause
 from nerif.fields.base import Field
-from nerif.forward.path_integral import LENS_RAYS, Projector
+from nerif.forward.path_integral import LENS_RAYS, FieldProjector
 from nerif.geometry import Rays
 
 __all__ = ["CurvedRays", "background_points", "trace"]
@@ -73,7 +73,7 @@ def background_points(field: Field, rays: Rays, steps: int = 150, n_ambient: flo
 
 
 @dataclass(frozen=True)
-class CurvedRays(Projector):
+class CurvedRays(FieldProjector):
     """The `traced` model: d = S (X - X0) with X the background point of the bent ray."""
 
     channels = 2

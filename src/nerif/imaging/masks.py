@@ -14,10 +14,11 @@ from jaxtyping import Bool, Shaped
 
 from nerif.common.conventions import InputError, unit_shown
 from nerif.common.files import atomic, ending
+from nerif.common.image_names import FOLDER_SUFFIXES
 from nerif.common.settings import NonNegative, Positive, check_settings
 from nerif.data.measurement import Measurement, Observation, integrals_of
 from nerif.imaging.readers.frames import as_float
-from nerif.imaging.readers.open import FOLDER_SUFFIXES, read_mask
+from nerif.imaging.readers.open import read_mask
 
 __all__ = ["MaskSettings", "MaskShape", "drawn_masks", "flow_mask", "mask_of", "with_flow_masks", "write_masks"]
 

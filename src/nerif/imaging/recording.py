@@ -232,9 +232,12 @@ def camera_of(view: View, calibrated: CalibratedCamera, shape: tuple[int, int]) 
         return calibrated.camera(image_size=shape)
     if crop is not None and calibrated.image_size == frame and not turned:
         return calibrated.camera().view(crop.row, crop.column, *shape)
+    remedy = "calibrate with the same crop, or with the whole frame and no flip"
+    if calibrated.image_size == shape[::-1]:
+        remedy = "is the size of the calibration (width, height), or are the images rotated? " + remedy.capitalize()
     raise InputError(
         f"its images have {shape[0]} x {shape[1]} px (height x width), its camera was calibrated "
-        f"with {calibrated.image_size}; calibrate with the same crop, or with the whole frame and no flip",
+        f"with {calibrated.image_size}; {remedy}",
         field=name,
     )
 

@@ -17,6 +17,7 @@ from torch import Tensor
 from nerif.common.conventions import InputError
 from nerif.common.files import atomic
 from nerif.common.written_files import OwnFiles
+from nerif.data.kinds import FIELD, RESULT, check_kind
 from nerif.data.measurement import Measurement
 from nerif.data.volume import INDEX
 from nerif.fields.base import Field
@@ -33,7 +34,7 @@ __all__ = [
     "read_state", "write_field", "write_state",
 ]  # fmt: skip
 
-FIELD, CHECKPOINT = "field.safetensors", "checkpoint.safetensors"
+CHECKPOINT = "checkpoint.safetensors"
 
 
 def fingerprint(measurement: Measurement, open_faces: tuple[str, ...] = ()) -> dict[str, str]:
@@ -127,6 +128,7 @@ def read_field(directory: Path) -> tuple[Field, Box, float]:
     """Read the field of a result directory, its box and n_ambient."""
     path = directory / FIELD
     if not path.is_file():
+        check_kind(directory, RESULT)
         what = "the directory has no" if directory.is_dir() else "no such directory with a"
         raise InputError(f"expected a reconstruction, but {what} {FIELD}; run nerif reconstruct first", field=directory)
     tensors, about = _load(path)

@@ -17,6 +17,7 @@ from nerif.common.conventions import InputError
 from nerif.common.files import atomic, read_toml, write_toml
 from nerif.common.written_files import WARN, OwnFiles, remove_empty
 from nerif.data.exports import export
+from nerif.data.kinds import RESULT, RUN, check_kind
 from nerif.data.measurement import Measurement
 from nerif.data.meridian import Meridian
 from nerif.data.reprojection import Reprojection
@@ -35,7 +36,7 @@ __all__ = [
     "CALIBRATION", "FIGURES", "METRICS", "REPORT", "RUN", "VOLUME", "Gap", "Result", "ResultDirectory", "versions",
 ]  # fmt: skip
 
-RUN, METRICS, HISTORY, REPORT = "run.toml", "metrics.json", "history.csv", "report.html"
+METRICS, HISTORY, REPORT = "metrics.json", "history.csv", "report.html"
 VOLUME, VOLUME_VTI, REPROJECTION = "volume.nc", "volume.vti", "reprojection.nc"
 MERIDIAN, LIVE, LIVE_FIELD = ("meridian.nc", "meridian.csv"), "live.json", "live.npz"
 TRIALS, CROSS_VALIDATION, FIGURES, CALIBRATION = "trials", "cross_validation", "figures", "calibration.toml"
@@ -272,9 +273,10 @@ class ResultDirectory:
         views : False to read only what a verdict needs, which is faster: settings, metrics, and the volumes if they
             have standard deviations
         """
-        if not self.path.is_dir():
-            raise InputError("no such directory; expected one written by nerif reconstruct", field=self.path)
         if not any((self.path / name).exists() for name in (*FILES, LIVE) if name != REPORT):
+            check_kind(self.path, RESULT)
+            if not self.path.is_dir():
+                raise InputError("no such directory; expected one written by nerif reconstruct", field=self.path)
             names = ", ".join((RUN, METRICS, HISTORY, VOLUME, REPROJECTION))
             raise InputError(f"expected a result of nerif reconstruct, got none of {names} in it", field=self.path)
         finished = self.has(FIELD)

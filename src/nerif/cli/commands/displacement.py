@@ -17,6 +17,7 @@ from nerif.common.interruption import if_interrupted
 from nerif.common.settings import Count, NonNegative
 from nerif.data.measurement import Measurement
 from nerif.data.measurement_sequence import MeasurementSequence
+from nerif.data.measurement_summary import valid_pixels
 from nerif.forward.deflection import Deflection
 from nerif.geometry import Box
 from nerif.imaging.displacement.displacement import DisplacementSettings
@@ -72,6 +73,8 @@ class Displacement(Settings):
         """Return images, cameras and box."""
         from nerif.imaging.calibration.importers.importers import import_box, import_cameras
 
+        views = find_views(self.folder, self.views)
+        cameras = {c.name: c for c in import_cameras(self.calibration)}
         box = Box.between(self.lower, self.upper) or import_box(self.calibration)
         if box is None:
             raise InputError(
@@ -81,8 +84,6 @@ class Displacement(Settings):
             )
         scene = Scene(box, self.surroundings)
         masks = MaskSettings(self.mask) if self.mask else None
-        views = find_views(self.folder, self.views)
-        cameras = {c.name: c for c in import_cameras(self.calibration)}
         return Recording(views, cameras, scene, self.method, masks, self.references, self.images)
 
 
@@ -127,13 +128,13 @@ def _print(measurement: Measurement, noise: Mapping[str, str]) -> None:
     assert measurement.sigma is not None
     (deflection,) = (o for o in measurement.observations if o.technique is Deflection)
     usable = measurement.usable_for(deflection)
-    for i, (name, camera) in enumerate(zip(measurement.names, measurement.cameras, strict=True)):
+    for i, (name, share) in enumerate(zip(measurement.names, measurement.valid_share(deflection), strict=True)):
         d, sigma = measurement.displacements[i][usable[i]], measurement.sigma[i][usable[i]]
-        share = len(d) / (camera.image_size[0] * camera.image_size[1])
         say(
             f"{name:<12}{share:>8.1%}{float(d.square().mean().sqrt()):>12.3f}"
             f"{float(d.norm(dim=-1).max()):>14.3f}{float(sigma.median()):>12.4f}  {noise[name]}"
         )
+    say(f"valid pixels: {valid_pixels(measurement)}")
 
 
 main = command("displacement", Displacement, run)

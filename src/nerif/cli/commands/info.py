@@ -14,18 +14,16 @@ from torch import Tensor
 from nerif.analysis.evaluation import rms_with_unit
 from nerif.cli.commands.output import say
 from nerif.cli.commands.settings import Settings, command
-from nerif.common.conventions import InputError, with_unit
-from nerif.common.files import ending
-from nerif.common.netcdf import opened
+from nerif.common.conventions import with_unit
+from nerif.data.kinds import MEASUREMENT, RESULT, VOLUME, check_kind, kind_of
 from nerif.data.measurement import Measurement
-from nerif.data.measurement_file import known_conventions
+from nerif.data.measurement_summary import valid_pixels
 from nerif.data.volume import INDEX, Volume, name_of
 from nerif.data.volume_file import read_volume
-from nerif.forward.registry import TECHNIQUES
 from nerif.plotting.notebook import number
 from nerif.results.directory import METRICS, ResultDirectory
 
-__all__ = ["Info", "is_measurement", "main", "run"]
+__all__ = ["Info", "main", "run"]
 
 
 @dataclass(frozen=True)
@@ -39,23 +37,13 @@ class Info(Settings):
 def run(settings: Info) -> None:
     """Print the description."""
     path = settings.path
+    check_kind(path, MEASUREMENT, VOLUME, RESULT)
     if path.is_dir():
         _result(path)
-    elif ending(path) == ".vti" or (ending(path) == ".nc" and path.is_file() and not is_measurement(path)):
+    elif kind_of(path) is VOLUME:
         _volume(path, read_volume(path))
     else:
         _measurement(path, Measurement.read(path))
-
-
-def is_measurement(path: Path) -> bool:
-    """Return whether a NetCDF file is a measurement rather than a volume, by conventions, variables or coordinates."""
-    try:
-        with opened(path, "a measurement or a volume") as dataset:
-            maps = any(kind.measured in dataset for kind in TECHNIQUES.values())
-            volume = {"x", "y", "z"} <= set(dataset.coords)
-            return known_conventions(dataset.attrs.get("Conventions")) or maps or not volume
-    except InputError:
-        return True
 
 
 def _corners(lower: tuple[float, ...], upper: tuple[float, ...]) -> str:
@@ -95,18 +83,19 @@ def _measurement(path: Path, m: Measurement) -> None:
         turn, shift = (float(torch.stack(sigmas)[:, part].square().mean().sqrt()) for part in (slice(3), slice(3, 6)))
         say(f"  pose_sigma     {math.degrees(turn):.2g} deg, {shift:.2g} mm (for --refine cameras)")
     say(f"  flow mask      {'yes' if m.flow_mask is not None else 'no'}")
-    columns = "".join(f"{f'rms {o.label}':>24}" for o in m.observations)
-    say(f"  view            size [px]  pixel [mm]   centre to camera [mm]   to background [mm]   usable{columns}")
-    usable, masks = m.usable, [m.usable_for(o) for o in m.observations]
+    say(f"  valid pixels   {valid_pixels(m)}")
+    columns = "".join(f"{f'valid {o.technique.data_name()}':>20}{f'rms {o.label}':>24}" for o in m.observations)
+    say(f"  view            size [px]  pixel [mm]   centre to camera [mm]   to background [mm]{columns}")
+    masks, shares = [m.usable_for(o) for o in m.observations], [m.valid_share(o) for o in m.observations]
     for i, c in enumerate(m.cameras):
         centre = c.centre.new_tensor(m.box.centre)
         distance, pixel, plane = float(c.distance(centre)), float(c.pixel_size(centre)), c.background
         behind = "none" if plane is None else f"{abs(float(centre @ plane.normal.to(centre)) - plane.offset):.1f}"
         data = [o.values[i][mask[i]] for o, mask in zip(m.observations, masks, strict=True)]
-        rms = "".join(f"{float(x.square().mean().sqrt()) if len(x) else math.nan:24.4f}" for x in data)
-        share = float(usable[i, : c.image_size[0], : c.image_size[1]].float().mean())
+        sizes = (float(x.square().mean().sqrt()) if len(x) else math.nan for x in data)
+        cells = "".join(f"{valid[i]:20.1%}{size:24.4f}" for valid, size in zip(shares, sizes, strict=True))
         size = f"{c.image_size[0]} x {c.image_size[1]}"
-        say(f"  {c.name:<14} {size:>10} {pixel:11.4g} {distance:23.1f} {behind:>20} {share:8.1%}{rms}")
+        say(f"  {c.name:<14} {size:>10} {pixel:11.4g} {distance:23.1f} {behind:>20}{cells}")
 
 
 def _volume(path: Path, v: Volume) -> None:

@@ -10,7 +10,6 @@ import tyro
 
 from nerif.cli.commands.output import MONITOR, check_output
 from nerif.cli.commands.settings import Settings, command
-from nerif.common.conventions import InputError
 from nerif.common.files import ending
 from nerif.results.directory import REPORT
 from nerif.workflow.reports import write_report, write_sequence_report
@@ -36,8 +35,6 @@ def run(settings: Report) -> Path:
     out = settings.out or (settings.result.with_suffix(".html") if is_store else settings.result / REPORT)
     if settings.out is not None:
         check_output(out, settings.force, endings=(".html", ".htm"))
-    elif not out.parent.is_dir():
-        raise InputError("no such directory", field=settings.result)
     write = write_sequence_report if is_store else write_report
     return write(settings.result, out, MONITOR)
 

@@ -9,12 +9,11 @@ from typing import Any
 import numpy as np
 
 from nerif.common.conventions import InputError
+from nerif.common.image_names import RAW
 from nerif.common.installation import install
 from nerif.imaging.readers.image_file import ImageFile
 
-__all__ = ["RAW_SUFFIXES", "CameraRaw"]
-
-RAW_SUFFIXES = (".nef", ".cr2", ".cr3", ".arw", ".dng", ".raf", ".orf", ".rw2", ".pef")
+__all__ = ["CameraRaw"]
 
 
 class CameraRaw(ImageFile):
@@ -71,6 +70,6 @@ def _rawpy() -> Any:
     except ImportError:
         raise InputError(
             f"expected the package rawpy, which is not installed; {install('raw')}, or export the images as TIFF",
-            field=f"raw images ({' '.join(RAW_SUFFIXES)})",
+            field=f"raw images ({' '.join(RAW)})",
         ) from None
     return rawpy

@@ -16,8 +16,9 @@ import numpy as np
 
 from nerif.common.conventions import InputError
 from nerif.common.files import ending
+from nerif.common.image_names import RAW
 from nerif.common.installation import install
-from nerif.imaging.readers.camera_raw import RAW_SUFFIXES, CameraRaw
+from nerif.imaging.readers.camera_raw import CameraRaw
 from nerif.imaging.readers.frames import Frames, check_size
 from nerif.imaging.readers.image_file import ImageFile
 from nerif.imaging.readers.packed import unpack
@@ -364,7 +365,7 @@ def _inverted(image: np.ndarray, bits: int) -> np.ndarray:
 
 OPENERS: dict[str, type[ImageFile]] = {
     ".tif": Tiff, ".tiff": Tiff, ".png": Png, ".bmp": Image, ".jpg": Image, ".jpeg": Image,
-    ".im7": LaVision, ".vc7": LaVision, ".b16": B16, **dict.fromkeys(RAW_SUFFIXES, CameraRaw),
+    ".im7": LaVision, ".vc7": LaVision, ".b16": B16, **dict.fromkeys(RAW, CameraRaw),
 }  # fmt: skip
 
 

@@ -18,25 +18,19 @@ from jaxtyping import Bool
 
 from nerif.common.conventions import InputError
 from nerif.common.files import ending, local_path
+from nerif.common.image_names import ARRAYS, FOLDER_SUFFIXES, HDF5, PHOTRON, SINGLE_SUFFIXES, SUFFIXES, VIDEO
 from nerif.imaging.readers.array_files import ArrayFrames, Hdf5Frames
 from nerif.imaging.readers.cine import CineFrames
 from nerif.imaging.readers.frames import Frames, SelectedFrames, size_in_words
-from nerif.imaging.readers.image_files import OPENERS, FileFrames
+from nerif.imaging.readers.image_files import FileFrames
 from nerif.imaging.readers.photron import PhotronFrames
 from nerif.imaging.readers.video import VideoFrames
 
-__all__ = ["FOLDER_SUFFIXES", "SUFFIXES", "open_frames", "read_mask"]
+__all__ = ["open_frames", "read_mask"]
 
-FOLDER_SUFFIXES = tuple(suffix for suffix in OPENERS if suffix != ".vc7")
 FILMS: dict[str, Callable[[Path, str], Frames]] = {
-    **dict.fromkeys((".cih", ".cihx", ".mraw"), PhotronFrames), ".cine": CineFrames,
-    **dict.fromkeys((".avi", ".mp4", ".m4v", ".mov", ".mkv"), VideoFrames),
+    **dict.fromkeys(PHOTRON, PhotronFrames), ".cine": CineFrames, **dict.fromkeys(VIDEO, VideoFrames),
 }  # fmt: skip
-ARRAYS: dict[str, Callable[[Path, str, str], Frames]] = {
-    **dict.fromkeys((".npy", ".npz"), ArrayFrames), **dict.fromkeys((".h5", ".hdf5", ".hdf"), Hdf5Frames)
-}  # fmt: skip
-SINGLE_SUFFIXES = (*FILMS, *ARRAYS)
-SUFFIXES = (*FOLDER_SUFFIXES, ".vc7", *SINGLE_SUFFIXES)
 READ = " ".join(SUFFIXES)
 EXPORT = "export other formats as TIFF"
 SELECTION = re.compile(r"(.+)\[(-?\d+|-?\d*:-?\d*(?::-?\d*)?)\]")
@@ -77,8 +71,10 @@ def read_mask(path: Path, shape: tuple[int, int]) -> Bool[np.ndarray, "row colum
         stored = frames[0]
     image = stored.astype(np.uint8) if stored.dtype == bool else frames[0]
     if image.shape != shape:
+        turned = "; rows and columns swapped? Rotate or transpose it" if image.shape == shape[::-1] else ""
         raise InputError(
-            f"expected a mask of {size_in_words(shape)} as the view, got {size_in_words(image.shape)}", field=path
+            f"expected a mask of {size_in_words(shape)} as the view, got {size_in_words(image.shape)}{turned}",
+            field=path,
         )
     low, high = float(image.min()), float(image.max())
     if low == high:
@@ -96,7 +92,7 @@ def _open_files(files: list[Path], names: list[str], dataset: str = "") -> Frame
     if suffix in FILMS:
         return FILMS[suffix](files[0], names[0])
     if suffix in ARRAYS:
-        return ARRAYS[suffix](files[0], names[0], dataset)
+        return (Hdf5Frames if suffix in HDF5 else ArrayFrames)(files[0], names[0], dataset)
     return FileFrames(files, names)
 
 
@@ -142,12 +138,12 @@ def _find_files(path: Path, base: Path | None) -> list[Path]:
 
 def _content(paths: list[Path], base: Path | None) -> str:
     """Describe paths among which are no images, with a remedy."""
-    endings = Counter(f"ending in {p.suffix.lower()}" if p.suffix else "without ending" for p in paths if p.is_file())
+    endings = Counter(f"ending in {ending(p)}" if p.suffix else "without ending" for p in paths if p.is_file())
     content = [f"{n} file{'s' * (n > 1)} {ending}" for ending, n in endings.most_common(4)]
     if folders := sum(p.is_dir() for p in paths):
         content.append(f"{folders} folder{'s' * (folders > 1)}")
     text = f"{', '.join(content) or 'none'}; "
-    if single := sorted(p for p in paths if p.suffix.lower() in SUFFIXES):
+    if single := sorted(p for p in paths if ending(p) in SUFFIXES):
         return text + f"name one file, such as '{_label(single[0], base)}'"
     return text + "is it the right folder?" + (f" Images end in {READ}; {EXPORT}" if endings else "")
 

@@ -30,18 +30,17 @@ from jaxtyping import Bool
 
 from nerif.common.conventions import InputError
 from nerif.common.files import check_known, ending, local_path, read_toml, write_toml
+from nerif.common.image_names import SOURCES, SUFFIXES
+from nerif.data.kinds import EXPERIMENT, reading_as
 from nerif.imaging.readers.crop import Crop
 from nerif.imaging.readers.exposure import check_exposure, full_scale
 from nerif.imaging.readers.frames import Frames, read_each, size_in_words
-from nerif.imaging.readers.open import SUFFIXES, open_frames, read_mask
+from nerif.imaging.readers.open import open_frames, read_mask
 
 __all__ = [
     "BEFORE", "SOURCES", "VIEWS", "Images", "View", "find_views", "good_images", "read_sample", "views_file",
     "write_crops",
 ]  # fmt: skip
-
-SOURCES = ("target", "background", "reference", "flow", "mask", "region")
-"""Images of a view: target, target on the background, without and with flow, and two drawn masks."""
 
 CROP = tuple(f.name for f in fields(Crop))
 HEADS = tuple(suffix for suffix in SUFFIXES if suffix != ".mraw")
@@ -116,6 +115,11 @@ class View:
 
 def find_views(folder: Path, only: Sequence[str] = ()) -> tuple[View, ...]:
     """Find the views of an experiment: those named in `only`, or all."""
+    with reading_as(folder, EXPERIMENT):
+        return _find(folder, only)
+
+
+def _find(folder: Path, only: Sequence[str]) -> tuple[View, ...]:
     if not folder.is_dir():
         raise InputError("no such folder; expected one with a folder for each view", field=folder)
     file = views_file(folder)

@@ -19,6 +19,7 @@ import torch
 from nerif.common.conventions import InputError
 from nerif.common.files import atomic
 from nerif.common.netcdf import reading
+from nerif.data.kinds import SEQUENCE_KIND, SEQUENCE_RESULT, check_kind
 from nerif.data.measurement_sequence import MeasurementSequence, add_frames, check_store
 from nerif.data.volume import Volume
 from nerif.data.volume_sequence import FIELDS, VolumeSequence, score_names
@@ -28,9 +29,8 @@ from nerif.geometry import Box, Grid
 from nerif.geometry.symmetry import Symmetry
 from nerif.reconstruction.bounds import in_units
 
-__all__ = ["DONE", "FAILED", "KIND", "MISSING", "Frame", "SequenceStore"]
+__all__ = ["DONE", "FAILED", "MISSING", "Frame", "SequenceStore"]
 
-KIND = "nerif sequence 1"  # attribute `kind` of the store
 MISSING, DONE, FAILED = 0, 1, 2
 
 
@@ -61,10 +61,7 @@ class SequenceStore(VolumeSequence):
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         super().__init__(path)
-        if self.attributes.get("kind") != KIND:
-            raise InputError(
-                f"expected the result of nerif sequence (attribute kind '{KIND}'), got another", field=path
-            )
+        check_kind(path, SEQUENCE_RESULT)
 
     @classmethod
     def begin(
@@ -87,7 +84,13 @@ class SequenceStore(VolumeSequence):
         like, frames = sequence.fullest(), len(sequence)
         check_store(path, FIELDS)
         names = [kind.name for kind in like.techniques]
-        about = {"kind": KIND, "network": vars(network), "views": list(like.names), "techniques": names, **attributes}
+        about = {
+            "kind": SEQUENCE_KIND,
+            "network": vars(network),
+            "views": list(like.names),
+            "techniques": names,
+            **attributes,
+        }
         with atomic(path) as part:
             group = VolumeSequence.create(part, sequence.times, grid, quantities, like.n_ambient, about).group
             views, parameters = len(like.names), sum(p.numel() for p in _network(about, grid.box).parameters())

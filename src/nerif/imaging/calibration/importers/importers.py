@@ -18,6 +18,7 @@ from annotated_types import Ge, Lt
 from nerif.common.conventions import InputError
 from nerif.common.files import ending
 from nerif.common.settings import Positive, check_settings
+from nerif.data.kinds import ARRAYS, CALIBRATION, IMAGES, reading_as
 from nerif.geometry import Box, Lens, Plane
 from nerif.geometry.distortion import POWERS
 from nerif.imaging.calibration.cameras_file import CalibratedCamera, check_camera, check_names, read_box
@@ -106,19 +107,8 @@ def import_cameras(
     say : called with lines about what was read
     """
     path = Path(path)
-    if not path.exists():
-        raise InputError(f"no such file; expected a calibration ({' '.join(ENDINGS)})", field=path)
-    unit = 1.0
-    if path.is_dir() or ending(path) in YAML:
-        cameras, unit = read_yaml_files(path, say)
-    elif ending(path) == ".mat":
-        cameras = read_matlab(path, settings.pose)
-    elif ending(path) == ".npz":
-        cameras = read_geometry(path, say)
-    elif ending(path) in READERS:
-        cameras = READERS[ending(path)](path)
-    else:
-        raise InputError(f"expected a calibration ending in {' '.join(ENDINGS)}, got '{path.suffix}'", field=path)
+    with reading_as(path, CALIBRATION, ignore=(ARRAYS, IMAGES)):
+        cameras, unit = _read(path, settings, say)
     if not cameras:
         raise InputError("holds no camera", field=path)
     check_names(cameras, str(path))
@@ -128,6 +118,21 @@ def import_cameras(
             raise InputError(f"expected some of {', '.join(names)}, got '{name}'", field="views")
     settings = replace(settings, scale_mm=settings.scale_mm or unit)
     return tuple(check_camera(_completed(c, settings), str(path)) for c in cameras if not only or c.name in only)
+
+
+def _read(path: Path, settings: ImportSettings, say: Callable[[str], None]) -> tuple[Sequence[CalibratedCamera], float]:
+    """Return the cameras of a file, and the unit of length by its format, mm."""
+    if not path.exists():
+        raise InputError(f"no such file; expected a calibration ({' '.join(ENDINGS)})", field=path)
+    if path.is_dir() or ending(path) in YAML:
+        return read_yaml_files(path, say)
+    if ending(path) == ".mat":
+        return read_matlab(path, settings.pose), 1.0
+    if ending(path) == ".npz":
+        return read_geometry(path, say), 1.0
+    if ending(path) in READERS:
+        return READERS[ending(path)](path), 1.0
+    raise InputError(f"expected a calibration ending in {' '.join(ENDINGS)}, got '{path.suffix}'", field=path)
 
 
 def import_box(path: Path, settings: ImportSettings = ImportSettings()) -> Box | None:

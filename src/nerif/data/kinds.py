@@ -1,0 +1,169 @@
+"""Kinds of files and folders: how each is recognised, and the command that takes it.
+
+Readers open them within `reading_as`: the error for a file of another kind names that kind and its command.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from nerif.common.conventions import InputError
+from nerif.common.files import ending
+from nerif.common.image_names import ARRAYS as NUMPY_AND_HDF5
+from nerif.common.image_names import FOLDER_SUFFIXES, SOURCES, SUFFIXES
+from nerif.common.netcdf import opened
+from nerif.forward.registry import TECHNIQUES
+
+__all__ = [
+    "ARRAYS", "BOST", "CALIBRATION", "EXPERIMENT", "FIELD", "IMAGES", "MEASUREMENT", "RESULT", "RUN", "SEQUENCE",
+    "SEQUENCE_KIND", "SEQUENCE_RESULT", "TRUE_SEQUENCE", "VOLUME", "Kind", "check_kind", "kind_of",
+    "known_conventions", "reading_as",
+]  # fmt: skip
+
+BOST = ("BOST-1.0", "BOST-1.1")
+"""Attribute Conventions of measurements: with the content of version 1.0, and with more."""
+RUN, FIELD = "run.toml", "field.safetensors"
+"""Settings and field of a result directory."""
+SEQUENCE_KIND = "nerif sequence 1"
+"""Attribute `kind` of the result of nerif sequence."""
+CALIBRATION_MARK = b"nerif-calibration"
+MAX_HEAD = 4096  # bytes of a text in which its mark is searched
+ARRAY_SUFFIXES = (*NUMPY_AND_HDF5, ".mat")  # HDF5 may also be NetCDF-4
+
+
+def known_conventions(conventions: object) -> bool:
+    """Return whether an attribute Conventions is that of a measurement."""
+    return isinstance(conventions, str) and conventions in BOST
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of file or folder.
+
+    Parameters
+    ----------
+    name : in words, with article
+    use : what to do with it, with the command; {path} and {parent} stand for it and its folder
+    """
+
+    name: str
+    use: str
+
+
+DISPLACEMENT = "nerif displacement {} --calibration calibration.toml -o m.nc"
+MEASUREMENT = Kind("a measurement (.nc)", "reconstruct it: nerif reconstruct {path} -o RESULT")
+VOLUME = Kind(
+    "a volume (.nc, .vti)",
+    "describe it: nerif info {path}, or compare a result with it: nerif evaluate RESULT --truth {path}",
+)
+RESULT = Kind(
+    "the result of one reconstruction (a folder)",
+    "show it: nerif report {path} or nerif figures {path}; other formats: nerif export {path} -o NAME.vti",
+)
+SEQUENCE = Kind("a measurement sequence (.zarr)", "reconstruct its frames: nerif sequence {path} -o NAME.zarr")
+SEQUENCE_RESULT = Kind(
+    "the result of nerif sequence (.zarr)", "show it: nerif movie {path} -o NAME.mp4 or nerif report {path}"
+)
+TRUE_SEQUENCE = Kind(
+    "true fields over time (.zarr)",
+    "show them: nerif movie {path} -o NAME.mp4, or compare a result: nerif evaluate RESULT.zarr --truth {path}",
+)
+EXPERIMENT = Kind("the images of an experiment (a folder)", f"compute displacements: {DISPLACEMENT.format('{path}')}")
+VIEW = Kind("the images of one view (a folder)", f"name the folder of all views: {DISPLACEMENT.format('{parent}')}")
+VIEWS = Kind("the list of views of an experiment", f"name its folder: {DISPLACEMENT.format('{parent}')}")
+IMAGES = Kind("images", f"put them into FOLDER/VIEW/reference and FOLDER/VIEW/flow: {DISPLACEMENT.format('FOLDER')}")
+ARRAYS = Kind(
+    "plain arrays", f"of images: {DISPLACEMENT.format('FOLDER')}; of displacements: nerif.Measurement in Python"
+)
+CALIBRATION = Kind("a calibration", "nerif displacement FOLDER --calibration {path} -o m.nc uses it")
+SETTINGS = Kind("the settings of a run", "repeat it: nerif reconstruct --config {path} -o RESULT")
+
+
+def kind_of(path: str | os.PathLike[str]) -> Kind | None:
+    """Return the kind of a file or folder; None if it does not exist, is damaged, or none of these."""
+    path = Path(path)
+    try:
+        return _of_folder(path) if path.is_dir() else _of_file(path) if path.is_file() else None
+    except (InputError, OSError):
+        return None
+
+
+def check_kind(path: str | os.PathLike[str], *wanted: Kind, ignore: tuple[Kind, ...] = ()) -> None:
+    """Raise an InputError for a path of another kind, with the command that takes it.
+
+    None is raised if the kind is unknown or one of `ignore`.
+    """
+    kind, path = kind_of(path), Path(path)
+    if kind is not None and kind not in (*wanted, *ignore):
+        use = kind.use.format(path=path, parent=path.parent)
+        *names, last = (k.name for k in wanted)
+        expected = f"{', '.join(names)} or {last}" if names else last
+        raise InputError(f"expected {expected}, got {kind.name}; {use}", field=path)
+
+
+@contextmanager
+def reading_as(path: str | os.PathLike[str], *wanted: Kind, ignore: tuple[Kind, ...] = ()) -> Iterator[None]:
+    """Read a file or folder; if that fails and it is of another kind, raise the error of `check_kind` instead."""
+    try:
+        yield
+    except InputError:
+        check_kind(path, *wanted, ignore=ignore)
+        raise
+
+
+def _of_folder(path: Path) -> Kind | None:
+    if (path / "zarr.json").is_file():
+        return _of_store(path / "zarr.json")
+    names = {entry.name.lower() for entry in path.iterdir()}
+    if names & {RUN, FIELD}:
+        return RESULT
+    if "views.toml" in names or any(_is_view(entry) for entry in path.iterdir() if entry.is_dir()):
+        return EXPERIMENT
+    if _is_view(path):
+        return VIEW
+    return IMAGES if any(name.endswith(FOLDER_SUFFIXES) for name in names) else None
+
+
+def _is_view(folder: Path) -> bool:
+    """Whether a folder has images without and with flow, or of a target."""
+    stems = {entry.name if entry.is_dir() else entry.stem for entry in folder.iterdir()}
+    return bool({stem.lower() for stem in stems} & {*SOURCES} - {"mask", "region"})
+
+
+def _of_store(metadata: Path) -> Kind | None:
+    try:
+        attributes = json.loads(metadata.read_text())["attributes"]
+    except (ValueError, KeyError, TypeError):
+        return None
+    if known_conventions(attributes.get("Conventions")):
+        return SEQUENCE
+    if attributes.get("kind") == SEQUENCE_KIND:
+        return SEQUENCE_RESULT
+    return TRUE_SEQUENCE if "box_lower_mm" in attributes else None
+
+
+def _of_file(path: Path) -> Kind | None:
+    suffix = ending(path)
+    if suffix == ".vti":
+        return VOLUME
+    if suffix == ".toml":
+        with path.open("rb") as file:
+            mark = CALIBRATION_MARK in file.read(MAX_HEAD)
+        return CALIBRATION if mark else {"views.toml": VIEWS, RUN: SETTINGS}.get(path.name.lower())
+    if suffix in SUFFIXES and suffix not in ARRAY_SUFFIXES:
+        return IMAGES
+    try:
+        with opened(path, "a measurement or a volume") as dataset:
+            maps = any(kind.measured in dataset for kind in TECHNIQUES.values())
+            if maps or known_conventions(dataset.attrs.get("Conventions")):
+                return MEASUREMENT
+            if {"x", "y", "z"} <= set(dataset.coords):
+                return VOLUME
+    except InputError:
+        pass
+    return ARRAYS if suffix in ARRAY_SUFFIXES else None

@@ -1,0 +1,126 @@
+"""Every command given every other kind of file: it names what it got, and the command that takes it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tifffile
+
+from commands import run
+from nerif.common.conventions import InputError
+from nerif.common.files import write_toml
+from nerif.data import kinds
+from nerif.data.exports import export
+from nerif.data.kinds import Kind, check_kind, kind_of
+from nerif.data.measurement import Measurement
+from nerif.data.measurement_sequence import MeasurementSequence
+from nerif.data.volume import Volume
+from nerif.data.volume_file import read_volume
+from nerif.data.volume_sequence import VolumeSequence
+from nerif.fields.network import NetworkShape
+from nerif.geometry import Grid
+from nerif.imaging.calibration.cameras_file import FORMAT
+from nerif.imaging.readers.views import find_views
+from nerif.reconstruction.voxels.tikhonov import Tikhonov
+from nerif.results.directory import ResultDirectory
+from nerif.workflow.sequence.store import SequenceStore
+
+FILES = {
+    "m.nc": kinds.MEASUREMENT, "volume.nc": kinds.VOLUME, "volume.vti": kinds.VOLUME, "result": kinds.RESULT,
+    "films.zarr": kinds.SEQUENCE, "truth.zarr": kinds.TRUE_SEQUENCE, "store.zarr": kinds.SEQUENCE_RESULT,
+    "lab": kinds.EXPERIMENT, "listed": kinds.EXPERIMENT, "lab/cam1": kinds.VIEW, "listed/views.toml": kinds.VIEWS,
+    "lab/cam1/flow": kinds.IMAGES, "lab/cam1/flow/1.TIF": kinds.IMAGES, "d.npy": kinds.ARRAYS,
+    "calibration.toml": kinds.CALIBRATION, "result/run.toml": kinds.SETTINGS,
+}  # fmt: skip
+STORES = (kinds.SEQUENCE_RESULT, kinds.TRUE_SEQUENCE)
+COMMANDS: dict[str, tuple[Kind, ...]] = {
+    "info {}": (kinds.MEASUREMENT, kinds.VOLUME, kinds.RESULT),
+    "check {}": (kinds.MEASUREMENT,),
+    "mask {} -o new.nc": (kinds.MEASUREMENT,),
+    "reconstruct {} -o new": (kinds.MEASUREMENT,),
+    "displacement {} --calibration calibration.toml -o new.nc": (kinds.EXPERIMENT,),
+    "project {} -o new.nc": (kinds.RESULT,),
+    "project result -o new.nc --cameras {}": (kinds.MEASUREMENT,),
+    "evaluate {} --truth volume.nc": (kinds.RESULT, *STORES),
+    "evaluate result --truth {}": (kinds.VOLUME,),
+    "evaluate result --measurement {}": (kinds.MEASUREMENT,),
+    "evaluate store.zarr --truth {}": STORES,
+    "sequence {} -o new.zarr": (kinds.SEQUENCE,),
+    "movie {} -o new.gif": STORES,
+    "report {} -o new.html": (kinds.RESULT, *STORES),
+    "figures {} -o new": (kinds.RESULT,),
+    "export {} -o new.csv": (kinds.RESULT,),
+}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory, measurement: Any, ball: Any) -> Path:
+    """One file or folder of every kind."""
+    out = tmp_path_factory.mktemp("kinds")
+    measurement.write(out / "m.nc")
+    grid = Grid(measurement.box, (4, 5, 6))
+    volume = Volume.of(ball.sample(grid), grid, "index_excess", 1.00027)
+    for name in ("volume.nc", "volume.vti"):
+        export(out / name, [volume])
+    result = ResultDirectory(out / "result")
+    result.begin({"method": "tikhonov"})
+    result.write_field(Tikhonov(voxels=8, regularisation=1e-3, iterations=2, device="cpu")(measurement))
+    films = MeasurementSequence.create(out / "films.zarr", [0.0, 0.1], measurement)
+    films.write_frame(0, measurement)
+    VolumeSequence.create(out / "truth.zarr", [0.0, 0.1], grid, ["index_excess"], 1.00027)
+    SequenceStore.begin(out / "store.zarr", films, grid, ["index_excess"], NetworkShape(width=8, depth=2), {})
+    for source in ("reference", "flow"):
+        (out / "lab" / "cam1" / source).mkdir(parents=True)
+        tifffile.imwrite(out / "lab" / "cam1" / source / "1.TIF", np.zeros((9, 12), dtype=np.uint8))
+    (out / "listed").mkdir()
+    write_toml(out / "listed" / "views.toml", {"views": {"left": {"flow": "1.tif"}}})
+    np.save(out / "d.npy", np.zeros((2, 9, 12, 2)))
+    write_toml(out / "calibration.toml", {"format": FORMAT})
+    (out / "empty").mkdir()
+    return out
+
+
+def test_kinds_are_recognised(folder):
+    assert {name: kind_of(folder / name) for name in FILES} == FILES
+    (folder / "cut.nc").write_bytes((folder / "m.nc").read_bytes()[:900])
+    for name in ("empty", "cut.nc", "none.nc"):
+        assert kind_of(folder / name) is None
+        check_kind(folder / name, kinds.VOLUME)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_command_names_the_kind_that_it_got(folder, monkeypatch, refusal, command):
+    monkeypatch.chdir(folder)
+    before = sorted(folder.rglob("*"))
+    for name, kind in FILES.items():
+        if kind not in COMMANDS[command]:
+            line = refusal(*(word.replace("{}", name) for word in command.split()))
+            use = kind.use.format(path=name, parent=Path(name).parent)
+            assert line.startswith(f"nerif: {name}: expected "), line
+            assert line.endswith(f", got {kind.name}; {use}\n"), line
+    assert sorted(folder.rglob("*")) == before
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_folder_that_holds_nothing_is_not_a_missing_one(folder, monkeypatch, refusal, command):
+    monkeypatch.chdir(folder)
+    for name, words in (("empty", "no such"), ("none", "")):
+        line = refusal(*(word.replace("{}", name) for word in command.split()))
+        assert line.startswith(f"nerif: {name}: ")
+        assert not words or words not in line
+
+
+def test_info_describes_its_kinds(folder, capsys):
+    for name, kind in FILES.items():
+        if kind in COMMANDS["info {}"]:
+            assert run("info", folder / name) == 0
+            assert str(folder / name) in capsys.readouterr().out
+
+
+def test_python_refuses_as_the_commands_do(folder):
+    for read, name in ((Measurement.read, "lab"), (read_volume, "m.nc"), (find_views, "m.nc"), (VolumeSequence, "lab")):
+        with pytest.raises(InputError, match=f", got {FILES[name].name}".replace("(", r"\(").replace(")", r"\)")):
+            read(folder / name)
