@@ -9,6 +9,7 @@ import difflib
 import glob
 import os
 import re
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from jaxtyping import Bool
 
 from nerif.common.conventions import InputError
 from nerif.imaging.readers.array_files import ArrayFrames, Hdf5Frames
+from nerif.imaging.readers.binning import binned_mask
 from nerif.imaging.readers.frames import Frames, SelectedFrames, size_in_words
 from nerif.imaging.readers.image_files import FileFrames
 from nerif.imaging.readers.photron import PhotronFrames
@@ -52,22 +54,34 @@ def open_frames(spec: str | Path, base: Path | None = None) -> Frames:
     return _select(frames, selection, _label(path, base)) if selection else frames
 
 
-def read_mask(path: Path, shape: tuple[int, int]) -> Bool[np.ndarray, "row column"]:
-    """Read a mask from an image of `shape`, of 1 bit or more: True above the middle of its range."""
+def read_mask(
+    path: Path, shape: tuple[int, int], say: Callable[[str], None] | None = None
+) -> Bool[np.ndarray, "row column"]:  # fmt: skip
+    """Read a mask from an image of `shape`, of 1 bit or more: True above the middle of its range.
+
+    Parameters
+    ----------
+    say : called with a line about a mask of twice the size, which is binned; None to refuse it
+    """
     frames = open_frames(path)
     try:
         stored = frames.load(0)
     except Exception:  # reported by the next line
         stored = frames[0]
     image = stored.astype(np.uint8) if stored.dtype == bool else frames[0]
-    if image.shape != shape:
+    is_twice = say is not None and tuple(n // 2 for n in image.shape) == shape
+    if image.shape != shape and not is_twice:
         raise InputError(
             f"expected a mask of {size_in_words(shape)} as the view, got {size_in_words(image.shape)}", field=path
         )
     low, high = float(image.min()), float(image.max())
     if low == high:
         raise InputError(f"expected a mask with black and white in it, got one grey of {high:g}", field=path)
-    return np.asarray(image > (low + high) / 2)
+    mask = np.asarray(image > (low + high) / 2)
+    if say is None or not is_twice:
+        return mask
+    say(f"note: {path}: drawn at twice the size of the view, binned to {size_in_words(shape)}")
+    return binned_mask(mask)
 
 
 def _open_files(files: list[Path], names: list[str], dataset: str = "") -> Frames:
