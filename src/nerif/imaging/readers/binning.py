@@ -17,7 +17,6 @@ from jaxtyping import Bool, Shaped
 from nerif.common.conventions import InputError
 from nerif.imaging.readers.exposure import full_scale, saturated
 from nerif.imaging.readers.frames import Frames
-from nerif.imaging.readers.mosaic import PATTERNS
 
 __all__ = ["Binning", "bin_alike", "binned_mask"]
 
@@ -69,11 +68,6 @@ def bin_alike(sources: Sequence[Frames], mosaic: str = "") -> None:
     """
     readable = [frames for frames in sources if _is_readable(frames)]
     for frames in readable if mosaic != "none" else ():
-        if frames.cfa is not None and not mosaic and len(frames.cfa) != len("RGGB"):
-            raise InputError(
-                f"expected a mosaic of 2 x 2 px ({', '.join(PATTERNS)}), got {frames.cfa}; convert the images to grey",
-                field=frames.layout.example,
-            )
         pattern = mosaic or frames.cfa or frames.layout.pattern
         if not pattern or min(frames.layout.shape) < 2:
             continue

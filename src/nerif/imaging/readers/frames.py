@@ -59,7 +59,7 @@ class Frames(ABC):
     """Bayer pattern of raw values in the metadata, such as RGGB: the colours of the first two pixels of the first two
     rows; None if unknown or none."""
     notes: tuple[str, ...] = ()
-    """Lines about the file, reported once per source."""
+    """Warnings about the file, each a line that begins with its name."""
     binning: Binning | None = None
     """Binning of the raw mosaic of a colour camera; None for grey frames."""
 
@@ -160,8 +160,8 @@ class SelectedFrames(Frames):
     """Some frames of another sequence."""
 
     def __init__(self, frames: Frames, indices: Sequence[int]) -> None:
-        self._frames, self._indices = frames, indices
-        self.metadata_bits, self.cfa, self.notes = frames.metadata_bits, frames.cfa, frames.notes
+        self._frames, self._indices, self.metadata_bits = frames, indices, frames.metadata_bits
+        self.cfa = frames.cfa
         if frames.times is not None:
             self.times = frames.times[list(indices)]
 
@@ -173,6 +173,10 @@ class SelectedFrames(Frames):
 
     def load(self, i: int) -> np.ndarray:
         return self._frames.load(self._indices[i])
+
+    @property
+    def notes(self) -> tuple[str, ...]:  # type: ignore[override]
+        return self._frames.notes
 
 
 def as_float(values: np.ndarray) -> np.ndarray:
