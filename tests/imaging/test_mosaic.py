@@ -24,7 +24,7 @@ from nerif.imaging.image_quality import image_quality
 from nerif.imaging.readers.binning import Binning
 from nerif.imaging.readers.crop import Crop
 from nerif.imaging.readers.exposure import saturated
-from nerif.imaging.readers.mosaic import PATTERNS, recognised_pattern
+from nerif.imaging.readers.mosaic import PATTERNS, bayer_pattern
 from nerif.imaging.readers.open import open_frames, read_mask
 from nerif.imaging.readers.views import View, find_views, good_images
 from nerif.imaging.recording import camera_of
@@ -80,8 +80,8 @@ SCENES = {
 def test_a_mosaic_is_recognised(rng, scene, pattern, bits):
     shape = (H + 13, W + 6)
     image = exposed(SCENES[scene](rng, shape) * filters(pattern, shape), rng, bits)
-    assert pattern in recognised_pattern(image).split(" or ")
-    assert recognised_pattern(image[:60, :100]) == ""  # less than four tiles
+    assert pattern in bayer_pattern(image).split(" or ")
+    assert bayer_pattern(image[:60, :100]) == ""  # less than four tiles
 
 
 @pytest.mark.parametrize(
@@ -89,7 +89,7 @@ def test_a_mosaic_is_recognised(rng, scene, pattern, bits):
 )
 def test_a_mosaic_is_recognised_in_light_of_any_colour(rng, gains):
     light = dots(rng) / max(gains.values())
-    assert recognised_pattern(exposed(light * filters("GBRG", (H, W), gains), rng))
+    assert bayer_pattern(exposed(light * filters("GBRG", (H, W), gains), rng))
 
 
 def row_offset(image: np.ndarray) -> np.ndarray:
@@ -121,8 +121,8 @@ GREY = {
 @pytest.mark.parametrize("bits", [8, 12])
 def test_grey_images_are_no_mosaics(rng, scene, bits):
     light = GREY[scene](rng, (H, W))
-    assert recognised_pattern(exposed(light, rng, bits)) == ""
-    assert recognised_pattern(np.rint(light * (2**bits - 1)).astype(np.uint16)) == ""  # without noise
+    assert bayer_pattern(exposed(light, rng, bits)) == ""
+    assert bayer_pattern(np.rint(light * (2**bits - 1)).astype(np.uint16)) == ""  # without noise
 
 
 def write_raw(folder: Path, light: np.ndarray, pattern: str, rng: np.random.Generator, flow: np.ndarray | None = None):
@@ -171,6 +171,7 @@ def test_uniform_light_becomes_a_uniform_image():
     binning = Binning("RGGB", (1000.0, 2000.0, 2000.0, 1300.0), 4095.0)
     image = np.tile(np.array([[1000, 2000], [2000, 1300]], np.uint16), (4, 5))[:7, :9]
     assert np.array_equal(binning(image), np.full((3, 4), 1575))
+    assert np.array_equal(replace(binning, means=(0.0,) * 4)(image), np.full((3, 4), 1575))  # of black frames
     scaled = binning(image.astype(np.float32) * 0.5)
     assert scaled.dtype == np.float32
     np.testing.assert_allclose(scaled, 1575 / 2, rtol=1e-6)

@@ -18,7 +18,7 @@ from nerif.common.conventions import InputError
 from nerif.imaging.readers.exposure import full_scale, saturated
 from nerif.imaging.readers.frames import Frames
 
-__all__ = ["Binning", "bin_alike", "binned_mask"]
+__all__ = ["Binning", "bin_mosaics", "binned_mask"]
 
 LARGEST_WEIGHT = 4.0  # relative to the brightest filter: more would amplify the noise of a dark one
 
@@ -41,7 +41,7 @@ class Binning:
     def __call__(self, image: Shaped[np.ndarray, "row column"]) -> Shaped[np.ndarray, "half_row half_column"]:
         """Return the binned image, of the same type."""
         means = np.maximum(self.means, max(*self.means, 1e-9) / LARGEST_WEIGHT).astype(np.float32)
-        weights = np.float32(np.mean(self.means)) / means
+        weights = means.mean() / means
         cells = _cells(image)
         grey = sum(weight * cell for weight, cell in zip(weights, cells, strict=True)) / np.float32(len(cells))
         brightest = np.maximum.reduce(cells)
@@ -58,7 +58,7 @@ def _cells(image: np.ndarray) -> list[np.ndarray]:
     return [image[r:height:2, c:width:2] for r in (0, 1) for c in (0, 1)]
 
 
-def bin_alike(sources: Sequence[Frames], mosaic: str = "") -> None:
+def bin_mosaics(sources: Sequence[Frames], mosaic: str = "") -> None:
     """Bin the frames of all sources if those of one are a raw mosaic, with the weights of the first such source.
 
     Parameters

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from nerif.common.conventions import InputError
-from nerif.imaging.readers.mosaic import phase_means, recognised_pattern
+from nerif.imaging.readers.mosaic import bayer_pattern, phase_means
 
 if TYPE_CHECKING:
     from nerif.imaging.readers.binning import Binning
@@ -110,7 +110,7 @@ class Frames(ABC):
                 continue
             used = int(np.bitwise_or.reduce(image, axis=None)) if image.dtype.kind == "u" else 0
             size = (image.shape[0], image.shape[1])
-            peak, means, pattern = float(image.max()), phase_means(image), recognised_pattern(image)
+            peak, means, pattern = float(image.max()), phase_means(image), bayer_pattern(image)
             layouts.append(Layout(size, image.dtype, self.name(i), peak, used, means, pattern))
         if not layouts:
             raise errors[0]

@@ -15,7 +15,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float, Shaped
 
-__all__ = ["PATTERNS", "phase_means", "recognised_pattern"]
+__all__ = ["PATTERNS", "bayer_pattern", "phase_means"]
 
 PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
 """Colours of the first two pixels of the first two rows."""
@@ -40,8 +40,8 @@ def phase_means(image: Shaped[np.ndarray, "row column"]) -> tuple[float, ...]:
     return tuple(float(place.mean()) if place.size else 0.0 for place in places)
 
 
-def recognised_pattern(image: Shaped[np.ndarray, "row column"]) -> str:
-    """Return the possible patterns of a raw mosaic, such as "RGGB or BGGR": grey values do not tell red from blue.
+def bayer_pattern(image: Shaped[np.ndarray, "row column"]) -> str:
+    """Return the possible patterns of a raw mosaic, such as "RGGB or BGGR": red and blue cannot be distinguished.
 
     The result is empty for other images, and for those of less than four tiles of 32 px.
     """

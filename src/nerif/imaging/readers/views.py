@@ -33,7 +33,7 @@ from jaxtyping import Bool
 
 from nerif.common.conventions import InputError
 from nerif.common.files import check_known, read_toml, write_toml
-from nerif.imaging.readers.binning import bin_alike
+from nerif.imaging.readers.binning import bin_mosaics
 from nerif.imaging.readers.crop import Crop
 from nerif.imaging.readers.exposure import check_exposure, full_scale
 from nerif.imaging.readers.frames import Frames, read_each, size_in_words
@@ -46,7 +46,7 @@ SOURCES = ("target", "background", "reference", "flow", "mask", "region")
 """Images of a view: target, target on the background, without and with flow, and two drawn masks."""
 
 TOGETHER = (("target", "background"), ("reference", "flow"))
-"""Images that are compared, and binned alike."""
+"""Images that are compared: if one of the two is binned, so is the other."""
 
 CROP = tuple(f.name for f in fields(Crop))
 BEFORE = "views.before.toml"
@@ -89,7 +89,7 @@ class View:
         return self._opened[source]
 
     def _open_together(self, source: str) -> dict[str, Frames]:
-        """Frames of a source and of those that are binned alike."""
+        """Frames of a source and of the one that is compared with it."""
         opened: dict[str, Frames] = {}
         for name in next((group for group in TOGETHER if source in group), (source,)):
             try:
@@ -98,7 +98,7 @@ class View:
             except InputError:  # of another source, reported when that is opened
                 if name == source:
                     raise
-        bin_alike(list(opened.values()), self.mosaic)
+        bin_mosaics(list(opened.values()), self.mosaic)
         return opened
 
     def notes(self, source: str) -> tuple[str, ...]:
