@@ -303,7 +303,7 @@ def test_csv_of_spreadsheets(tmp_path, program):
     ("delimiter", "change", "words"),
     [
         (",", {"fx": '"1500,5"'}, "commas in quotes"),
-        (",", {"fx": "1500,5"}, "line 2: expected 28 columns, got 29; separate them by semicolons"),
+        (",", {"fx": "1500,5"}, "line 2: expected 30 columns, got 31; separate them by semicolons"),
         (";", {"fx": "1.500,5"}, "got commas and points"),
         (";", {"width": "640.5"}, "image_size: expected height and width, whole numbers"),
         (";", {"FX": "3"}, "expected each column once, got 'fx' twice"),

@@ -121,6 +121,19 @@ def test_drawn_masks_take_precedence(four, tmp_path):
             drawn_masks(folder, names)
 
 
+def test_masks_drawn_at_twice_the_size_are_binned_and_reported(four, tmp_path):
+    image = np.zeros((128, 128), np.uint8)
+    image[20:100, 41:80] = 255
+    iio.imwrite(tmp_path / f"{four.names[1]}.png", image)
+    drawings = drawn_masks(tmp_path, four.names)
+    with refused(tmp_path / f"{four.names[1]}.png"):
+        with_flow_masks(four, drawings=drawings)
+    lines: list[str] = []
+    mask = with_flow_masks(four, drawings=drawings, say=lines.append).flow_mask[1]
+    assert torch.equal(mask, torch.from_numpy(image[::2, ::2] > 0))  # without the column of which half is inside
+    assert len(lines) == 1
+
+
 @pytest.mark.parametrize("name", ["cam1.jpg", "cam1.PNG", "Cam1.png", "CAM1.TIFF"])
 def test_drawings_with_any_ending_and_letters(tmp_path, name):
     image = np.zeros((40, 40), np.uint8)

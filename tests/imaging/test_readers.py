@@ -569,7 +569,7 @@ def test_reference_and_flow_have_one_size_and_depth(tmp_path, stack12, stack8):
             "films",
             "got 3 files ending in .wmv, 1 file without ending, 1 folder; .* export other formats as TIFF",
         ),
-        ("films/*.wmv", "films/*.wmv", "got 2 files ending in .wmv; .* TIFF"),
+        ("films/*.wmv", "films/*.wmv", "got 3 files ending in .wmv; .* TIFF"),
         ("notes.txt", "notes.txt", "'.txt'; export other formats as TIFF"),
         ("arrays/*.npy", "arrays/a.npy", "one recording"),
     ],

@@ -70,7 +70,7 @@ class ImageFiles:
         return self._from_cache(view, source, ("detection", number, target), read)
 
     def _from_cache(self, view: View, source: str, what: tuple[Any, ...], read: Any) -> Any:
-        key = str(Path(view.folder)), view.name, view.sources.get(source), source, view.crop, what
+        key = str(Path(view.folder)), view.name, view.sources.get(source), source, view.crop, view.mosaic, what
         stamp = self.stamp(view, source) if source in view.sources else ()
         with self._lock:
             entry = self._cache.get(key)

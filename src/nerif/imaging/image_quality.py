@@ -34,7 +34,7 @@ class ImageQuality:
     saturated : share of saturated pixels in the first good image
     histogram : share of its pixels per bin from 0 to full scale
     bad : names of unusable images, and why
-    notes : warnings about the files, and of bad exposure
+    notes : how the files are read, and warnings about them and of bad exposure
     first : number of the first good image
     """
 
@@ -54,7 +54,7 @@ def image_quality(view: View, source: str, most: int = 12) -> ImageQuality:
     """Read `most` evenly spread images of a source such as "reference" or "flow" (0: all), and return their quality."""
     frames, sampled = view.open(source), 0
     bad: list[tuple[str, str]] = []
-    notes = list(frames.notes)
+    notes = list(view.notes(source))
     good: tuple[int, np.ndarray] | None = None
     for i, name, image in read_sample(view, source, most):
         sampled += 1

@@ -195,6 +195,7 @@ def with_flow_masks(
     sigma: float | None = None,
     drawings: Mapping[str, Path] | None = None,
     on_view: Callable[[int], None] = lambda count: None,
+    say: Callable[[str], None] | None = None,
 ) -> Measurement:
     """Return a measurement with a flow mask for each view: the drawn one, else by threshold of any technique.
 
@@ -204,6 +205,7 @@ def with_flow_masks(
     sigma : noise, in the unit of the measured quantity, instead of the measurement's own
     drawings : images of masks by the names of views
     on_view : called with the number of finished views
+    say : called with a line about drawings of twice the size of their views, which are binned; None to refuse them
     """
     drawings = drawings or {}
     observations = integrals_of(measurement)
@@ -216,7 +218,7 @@ def with_flow_masks(
         height, width = camera.image_size
         inside = (i, slice(0, height), slice(0, width))
         if name in drawings:
-            mask = read_mask(drawings[name], camera.image_size)
+            mask = read_mask(drawings[name], camera.image_size, say)
         else:
             valid, flow = np.zeros(camera.image_size, dtype=bool), np.zeros(camera.image_size, dtype=bool)
             for o, pixels in zip(observations, usable, strict=True):

@@ -185,7 +185,7 @@ class ViewReference:
         shape = (images[0].shape[0], images[0].shape[1])
         camera = camera_of(view, recording.cameras[view.name], shape)
         reference = Reference.of(images, recording.method, view.full_scale, averages)
-        region, drawn_mask = view.mask("region", shape), view.mask("mask", shape)
+        region, drawn_mask = (view.mask(source, shape, say) for source in ("region", "mask"))
         return cls(view, camera, reference, recording.masks, region, drawn_mask, recording.images)
 
     def measure(self, numbers: Sequence[int], say: Callable[[str], None] = silent) -> ViewMeasurement:
@@ -211,7 +211,7 @@ class ViewReference:
 
 
 def camera_of(view: View, calibrated: CalibratedCamera, shape: tuple[int, int]) -> Camera:
-    """Return the camera of a view's images, which may be a crop of those it was calibrated with."""
+    """Return the camera of a view's images, which may be a crop of those it was calibrated with, or binned."""
     name = f"view '{view.name}'"
     if calibrated.background is None:
         raise InputError(
@@ -219,15 +219,19 @@ def camera_of(view: View, calibrated: CalibratedCamera, shape: tuple[int, int]) 
             "target laid on the background, or give nerif calibrate --background-distance",
             field=name,
         )
-    crop, frame = view.crop, view.open("flow").shape
+    frames, crop = view.open("flow"), view.crop
+    frame, stored, is_binned = frames.shape, frames.layout.shape, frames.binning is not None
     turned = crop is not None and bool(crop.flip or crop.rotate)
-    if calibrated.image_size is None and crop is not None and (turned or frame != shape):
+    if calibrated.image_size is None and (is_binned or (crop is not None and (turned or frame != shape))):
+        how = "a raw Bayer mosaic, binned to half the size" if is_binned else "cropped or turned (views.toml)"
         raise InputError(
-            "its images are cropped or turned (views.toml), and its camera has no image size, so that the crop of the "
-            f"calibration is unknown; add it: nerif calibrate FILE --image-size {shape[0]} {shape[1]} (the crop) or "
-            f"{frame[0]} {frame[1]} (the whole frame)",
+            f"its images are {how}, and its camera has no image size, so that those of the calibration are unknown; "
+            f"add it: nerif calibrate FILE --image-size {shape[0]} {shape[1]} (as used here) or "
+            f"{stored[0]} {stored[1]} (the whole frame)",
             field=name,
         )
+    if is_binned and calibrated.image_size == stored:
+        calibrated = calibrated.binned()
     if calibrated.image_size in (None, shape):
         return calibrated.camera(image_size=shape)
     if crop is not None and calibrated.image_size == frame and not turned:
@@ -235,6 +239,8 @@ def camera_of(view: View, calibrated: CalibratedCamera, shape: tuple[int, int]) 
     remedy = "calibrate with the same crop, or with the whole frame and no flip"
     if calibrated.image_size == shape[::-1]:
         remedy = "is the size of the calibration (width, height), or are the images rotated? " + remedy.capitalize()
+    if not is_binned and calibrated.image_size == (stored[0] // 2, stored[1] // 2):
+        remedy += '; if its target images were binned as a raw Bayer mosaic, set mosaic = "RGGB" in views.toml'
     raise InputError(
         f"its images have {shape[0]} x {shape[1]} px (height x width), its camera was calibrated "
         f"with {calibrated.image_size}; {remedy}",

@@ -52,7 +52,7 @@ def run(settings: Mask) -> Measurement:
         return measurement
     drawings = {} if settings.drawings is None else drawn_masks(settings.drawings, measurement.names, say)
     with counting_bar("masking the flow", len(measurement.names)) as bar:
-        measurement = with_flow_masks(measurement, settings.masks, settings.sigma, drawings, bar)
+        measurement = with_flow_masks(measurement, settings.masks, settings.sigma, drawings, bar, say)
     assert measurement.flow_mask is not None
     hull = visual_hull(measurement, Grid.of_resolution(measurement.box, 64))
     measurement.write(settings.out)

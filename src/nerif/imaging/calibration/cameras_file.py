@@ -77,6 +77,15 @@ class CalibratedCamera:
             raise InputError(f"view '{self.name}' has no image size in its calibration; give --image-size HEIGHT WIDTH")
         return Camera(**{**vars(self), "image_size": size, "background": background or self.background})
 
+    def binned(self) -> CalibratedCamera:
+        """Return the camera of images whose pixels are cells of 2 x 2 px of those it was calibrated with.
+
+        A position p in px becomes (p + 1/2) / 2 - 1/2: pixel (0, 0) is centred on the corner of four old ones.
+        """
+        halved = torch.tensor([[0.5, 0, -0.25], [0, 0.5, -0.25], [0, 0, 1]], dtype=torch.float64)
+        size = None if self.image_size is None else (self.image_size[0] // 2, self.image_size[1] // 2)
+        return replace(self, intrinsics=halved @ self.intrinsics, image_size=size)
+
     @classmethod
     def from_camera(cls, camera: Camera) -> CalibratedCamera:
         """Return the same camera as one of a calibration."""

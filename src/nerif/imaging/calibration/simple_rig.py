@@ -109,7 +109,7 @@ class SimpleRig:
 def find_image(
     source: Path, only: Sequence[str] = (), image_size: tuple[int, int] | None = None
 ) -> tuple[str, tuple[int, int]]:
-    """Return the name of the one view of an experiment, and the height and width of its images, px.
+    """Return the name of the one view of an experiment, and the height and width of its images as stored, px.
 
     Parameters
     ----------
@@ -127,8 +127,16 @@ def find_image(
         raise InputError(f"expected one view for a simple rig, found {names}; choose with --views NAME", field="views")
     (view,) = views
     if image_size is None:
-        shape = view.open("reference").shape
-        image_size = view.crop.shape_of(shape, view.open("reference").name(0)) if view.crop else shape
+        frames = view.open("reference")
+        image_size = frames.layout.shape  # in which the axis and the scale are measured, even if they are binned
+        if view.crop and frames.binning is not None:
+            raise InputError(
+                "its images are a raw Bayer mosaic, binned and cropped; give --image-size HEIGHT WIDTH of the images "
+                f"in which the axis and the scale were measured, {image_size[0]} {image_size[1]} if they are the files",
+                field=f"view '{view.name}'",
+            )
+        if view.crop:
+            image_size = view.crop.shape_of(image_size, frames.name(0))
     return view.name, image_size
 
 

@@ -21,7 +21,7 @@ def find_targets(
     on_image: Callable[[], None] = lambda: None,
     on_background: CalibrationTarget | None = None,
 ) -> ViewImages:
-    """Detect the target in all images of a view and report the images without a detection.
+    """Detect the target in all images of a view; report how these are read, and those without a detection.
 
     `on_background` is the target on the background, if it differs (a larger print).
     """
@@ -33,7 +33,7 @@ def find_targets(
             continue
         frames = view.open(source)
         names = pose_names(frames)
-        for note in frames.notes:
+        for note in view.notes(source):
             say(f"note: {note}")
         for i, image in read_each(frames, range(len(frames))):
             if isinstance(image, InputError):

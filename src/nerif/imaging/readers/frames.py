@@ -9,10 +9,15 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from nerif.common.conventions import InputError
+from nerif.imaging.readers.mosaic import bayer_pattern, phase_means
+
+if TYPE_CHECKING:
+    from nerif.imaging.readers.binning import Binning
 
 __all__ = ["Frames", "Layout", "SelectedFrames", "as_float", "check_size", "read_each", "size_in_words"]
 
@@ -23,7 +28,7 @@ MOST_PIXELS = 2**28  # of a frame, more than any sensor has: a damaged header mu
 
 @dataclass(frozen=True)
 class Layout:
-    """Common properties of most of the sampled frames of a sequence.
+    """Common properties of most of the sampled frames of a sequence, as they are stored.
 
     Parameters
     ----------
@@ -32,6 +37,8 @@ class Layout:
     example : name of a frame with these properties
     peak : largest value
     used : bits set in any value, 0 for floats
+    means : grey values at the places (0, 0), (0, 1), (1, 0), (1, 1) of cells of 2 x 2 px
+    pattern : of a raw mosaic recognised in most of them, such as "RGGB or BGGR"; "" if there is none
     """
 
     shape: tuple[int, int]
@@ -39,6 +46,8 @@ class Layout:
     example: str
     peak: float
     used: int
+    means: tuple[float, ...]
+    pattern: str
 
 
 class Frames(ABC):
@@ -55,6 +64,8 @@ class Frames(ABC):
     rows; None if unknown or none."""
     notes: tuple[str, ...] = ()
     """Warnings about the file, each a line that begins with its name."""
+    binning: Binning | None = None
+    """Binning of the raw mosaic of a colour camera; None for grey frames."""
 
     @abstractmethod
     def __len__(self) -> int: ...
@@ -69,6 +80,13 @@ class Frames(ABC):
 
     def single(self, i: int) -> np.ndarray:
         """Return frame `i` as uint8, uint16 or float32 (row, column), not compared with the others."""
+        return self._binned(self._full_size(i))
+
+    def _binned(self, image: np.ndarray) -> np.ndarray:
+        return image if self.binning is None else self.binning(image)
+
+    def _full_size(self, i: int) -> np.ndarray:
+        """Frame `i` at its full size."""
         try:
             image = self.load(i)
         except (InputError, MemoryError):
@@ -90,24 +108,29 @@ class Frames(ABC):
             if layouts and k >= min(SAMPLE, n):
                 break
             try:
-                image = self.single(i)
+                image = self._full_size(i)
             except InputError as error:
                 errors.append(error)
                 continue
             used = int(np.bitwise_or.reduce(image, axis=None)) if image.dtype.kind == "u" else 0
             size = (image.shape[0], image.shape[1])
-            layouts.append(Layout(size, image.dtype, self.name(i), float(image.max()), used))
+            peak, means, pattern = float(image.max()), phase_means(image), bayer_pattern(image)
+            layouts.append(Layout(size, image.dtype, self.name(i), peak, used, means, pattern))
         if not layouts:
             raise errors[0]
         (majority, _), *_ = Counter((x.shape, x.dtype) for x in layouts).most_common()
         agreeing = [x for x in layouts if (x.shape, x.dtype) == majority]
         used = int(np.bitwise_or.reduce([x.used for x in agreeing]))
-        return Layout(*majority, agreeing[0].example, max(x.peak for x in agreeing), used)
+        means = tuple(np.mean([x.means for x in agreeing], axis=0).tolist())
+        patterns = Counter(x.pattern for x in agreeing if x.pattern)
+        pattern = patterns.most_common(1)[0][0] if 2 * patterns.total() > len(agreeing) else ""
+        return Layout(*majority, agreeing[0].example, max(x.peak for x in agreeing), used, means, pattern)
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Height and width, px."""
-        return self.layout.shape
+        """Height and width of a frame, px; half of those stored if it is binned."""
+        height, width = self.layout.shape
+        return (height, width) if self.binning is None else (height // 2, width // 2)
 
     @property
     def bits(self) -> int:
@@ -127,14 +150,14 @@ class Frames(ABC):
         if not -n <= i < n:
             raise IndexError(f"{self.name(0)}: frame {i} of {n}")
         i %= n
-        image, layout = self.single(i), self.layout
+        image, layout = self._full_size(i), self.layout
         if (image.shape, image.dtype) != (layout.shape, layout.dtype):
             raise InputError(
                 f"expected {size_in_words(layout.shape)} of {layout.dtype} as in {layout.example}, "
                 f"got {size_in_words(image.shape)} of {image.dtype}; other frames need a sequence of their own",
                 field=self.name(i),
             )
-        return image
+        return self._binned(image)
 
 
 class SelectedFrames(Frames):

@@ -20,6 +20,7 @@ from nerif.common.conventions import InputError
 from nerif.common.files import ending, local_path
 from nerif.common.image_names import ARRAYS, FOLDER_SUFFIXES, HDF5, PHOTRON, SINGLE_SUFFIXES, SUFFIXES, VIDEO
 from nerif.imaging.readers.array_files import ArrayFrames, Hdf5Frames
+from nerif.imaging.readers.binning import binned_mask
 from nerif.imaging.readers.cine import CineFrames
 from nerif.imaging.readers.frames import Frames, SelectedFrames, size_in_words
 from nerif.imaging.readers.image_files import FileFrames
@@ -62,15 +63,23 @@ def open_frames(spec: str | Path, base: Path | None = None) -> Frames:
     return _select(frames, selection, _label(path, base)) if selection else frames
 
 
-def read_mask(path: Path, shape: tuple[int, int]) -> Bool[np.ndarray, "row column"]:
-    """Read a mask from an image of `shape`, of 1 bit or more: True above the middle of its range."""
+def read_mask(
+    path: Path, shape: tuple[int, int], say: Callable[[str], None] | None = None
+) -> Bool[np.ndarray, "row column"]:  # fmt: skip
+    """Read a mask from an image of `shape`, of 1 bit or more: True above the middle of its range.
+
+    Parameters
+    ----------
+    say : called with a line about a mask of twice the size, which is binned; None to refuse it
+    """
     frames = open_frames(path)
     try:
         stored = frames.load(0)
     except Exception:  # reported by the next line
         stored = frames[0]
     image = stored.astype(np.uint8) if stored.dtype == bool else frames[0]
-    if image.shape != shape:
+    is_twice = say is not None and tuple(n // 2 for n in image.shape) == shape
+    if image.shape != shape and not is_twice:
         turned = "; rows and columns swapped? Rotate or transpose it" if image.shape == shape[::-1] else ""
         raise InputError(
             f"expected a mask of {size_in_words(shape)} as the view, got {size_in_words(image.shape)}{turned}",
@@ -79,7 +88,11 @@ def read_mask(path: Path, shape: tuple[int, int]) -> Bool[np.ndarray, "row colum
     low, high = float(image.min()), float(image.max())
     if low == high:
         raise InputError(f"expected a mask with black and white in it, got one grey of {high:g}", field=path)
-    return np.asarray(image > (low + high) / 2)
+    mask = np.asarray(image > (low + high) / 2)
+    if say is None or not is_twice:
+        return mask
+    say(f"note: {path}: drawn at twice the size of the view, binned to {size_in_words(shape)}")
+    return binned_mask(mask)
 
 
 def _open_files(files: list[Path], names: list[str], dataset: str = "") -> Frames:
@@ -139,7 +152,7 @@ def _find_files(path: Path, base: Path | None) -> list[Path]:
 def _content(paths: list[Path], base: Path | None) -> str:
     """Describe paths among which are no images, with a remedy."""
     endings = Counter(f"ending in {ending(p)}" if p.suffix else "without ending" for p in paths if p.is_file())
-    content = [f"{n} file{'s' * (n > 1)} {ending}" for ending, n in endings.most_common(4)]
+    content = [f"{n} file{'s' * (n > 1)} {what}" for what, n in endings.most_common(4)]
     if folders := sum(p.is_dir() for p in paths):
         content.append(f"{folders} folder{'s' * (folders > 1)}")
     text = f"{', '.join(content) or 'none'}; "

@@ -14,6 +14,9 @@ A `views.toml` in the folder replaces that layout. Entries above the tables hold
     height = 512
     width = 512
     flip = "horizontal"                 # seen through a mirror
+    mosaic = "none"                     # raw colour images: the Bayer pattern, such as RGGB, or none; else recognised
+
+Raw images of a colour camera are binned as they are read: rows and columns of a crop are those of the binned images.
 """
 
 from __future__ import annotations
@@ -32,15 +35,20 @@ from nerif.common.conventions import InputError
 from nerif.common.files import check_known, ending, local_path, read_toml, write_toml
 from nerif.common.image_names import SOURCES, SUFFIXES
 from nerif.data.kinds import EXPERIMENT, reading_as
+from nerif.imaging.readers.binning import bin_mosaics
 from nerif.imaging.readers.crop import Crop
 from nerif.imaging.readers.exposure import check_exposure, full_scale
 from nerif.imaging.readers.frames import Frames, read_each, size_in_words
+from nerif.imaging.readers.mosaic import PATTERNS
 from nerif.imaging.readers.open import open_frames, read_mask
 
 __all__ = [
     "BEFORE", "SOURCES", "VIEWS", "Images", "View", "find_views", "good_images", "read_sample", "views_file",
     "write_crops",
 ]  # fmt: skip
+
+TOGETHER = (("target", "background"), ("reference", "flow"))
+"""Images that are compared: if one of the two is binned, so is the other."""
 
 CROP = tuple(f.name for f in fields(Crop))
 HEADS = tuple(suffix for suffix in SUFFIXES if suffix != ".mraw")
@@ -59,17 +67,19 @@ class View:
     folder : base of relative sources
     sources : arguments of open_frames, by the names of SOURCES
     crop : the view's part of each frame
+    mosaic : Bayer pattern of its raw images, such as RGGB, or "none"; "" where it is in the metadata or is recognised
     """
 
     name: str
     folder: Path
     sources: dict[str, str]
     crop: Crop | None = None
+    mosaic: str = ""
     _opened: dict[str, Frames] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __reduce__(self) -> tuple[type[View], tuple[object, ...]]:
         """State for another process, which opens the files itself."""
-        return View, (self.name, self.folder, self.sources, self.crop)
+        return View, (self.name, self.folder, self.sources, self.crop, self.mosaic)
 
     def open(self, source: str) -> Frames:
         """Return the frames of a source, opened once."""
@@ -80,17 +90,51 @@ class View:
                 field=f"view '{self.name}'",
             )
         if source not in self._opened:
-            self._opened[source] = open_frames(self.sources[source], self.folder)
+            self._opened.update(self._open_together(source))
         return self._opened[source]
+
+    def _open_together(self, source: str) -> dict[str, Frames]:
+        """Frames of a source and of the one that is compared with it."""
+        opened: dict[str, Frames] = {}
+        for name in next((group for group in TOGETHER if source in group), (source,)):
+            try:
+                if name in self.sources:
+                    opened[name] = open_frames(self.sources[name], self.folder)
+            except InputError:  # of another source, reported when that is opened
+                if name == source:
+                    raise
+        bin_mosaics(list(opened.values()), self.mosaic)
+        return opened
+
+    def notes(self, source: str) -> tuple[str, ...]:
+        """Return lines about the files of a source, and how they are read."""
+        frames = self.open(source)
+        if frames.binning is None:
+            return frames.notes
+        height, width = frames.shape
+        line = f"{self.sources[source]}: raw Bayer mosaic ({frames.binning.pattern}), binned to {height} x {width} px"
+        override = "" if self.mosaic else '; mosaic = "none" in views.toml keeps all pixels'
+        return *frames.notes, line + override
 
     @property
     def full_scale(self) -> float:
         """Grey value of a saturated pixel, by the images without and with flow."""
         return full_scale(self.open("reference"), self.open("flow"))
 
-    def mask(self, source: str, shape: tuple[int, int]) -> Bool[np.ndarray, "row column"] | None:
-        """Return the drawn mask of the view, "mask" or "region", or None."""
-        return read_mask(self.folder / self.sources[source], shape) if source in self.sources else None
+    def mask(
+        self, source: str, shape: tuple[int, int], say: Callable[[str], None]
+    ) -> Bool[np.ndarray, "row column"] | None:  # fmt: skip
+        """Return the drawn mask of the view, "mask" or "region", or None.
+
+        Parameters
+        ----------
+        shape : height and width of the view's images, px; a mask of binned images may have twice the size
+        say : called with a line about such a mask
+        """
+        if source not in self.sources:
+            return None
+        is_binned = self.open("reference").binning is not None
+        return read_mask(self.folder / self.sources[source], shape, say if is_binned else None)
 
     def check_alike(self) -> None:
         """Check that the images without and with flow have one size and bit depth."""
@@ -179,18 +223,23 @@ def _from_file(file: Path) -> list[View]:
     views = []
     for name, entries in tables.items():
         entries = {**table, **entries}
-        check_known(entries, (*SOURCES, *CROP), str(file))
+        check_known(entries, (*SOURCES, *CROP, "mosaic"), str(file))
         for key, value in entries.items():
-            kind = str if key in (*SOURCES, "flip") else int
+            kind = str if key in (*SOURCES, "flip", "mosaic") else int
             if not isinstance(value, kind) or isinstance(value, bool):
                 raise InputError(f"'{key}' of view '{name}': expected {kind.__name__}, got {value!r}", field=file)
+        mosaic = entries.get("mosaic", "")
+        if mosaic not in ("", "none", *PATTERNS):
+            raise InputError(
+                f"'mosaic' of view '{name}': expected {', '.join(PATTERNS)} or none, got '{mosaic}'", field=file
+            )
         crop = {k: v for k, v in entries.items() if k in CROP}
         sources = {
             k: str(local_path(v, file.parent, f"{file}: {k} of view '{name}'"))
             for k, v in entries.items()
             if k in SOURCES
         }
-        views.append(View(name, file.parent, sources, Crop(**crop) if crop else None))
+        views.append(View(name, file.parent, sources, Crop(**crop) if crop else None, mosaic))
     return views
 
 
@@ -254,7 +303,7 @@ def read_sample(view: View, source: str, most: int = 0) -> Iterator[tuple[int, s
 def good_images(view: View, source: str, say: Callable[[str], None], most: int = 0) -> Images:
     """Return the usable images out of `most` evenly spread ones of a source (0: all); report what is wrong."""
     frames, numbers, errors = view.open(source), [], []
-    for note in frames.notes:
+    for note in view.notes(source):
         say(f"note: {note}")
     for i, name, image in read_sample(view, source, most):
         if isinstance(image, InputError):
