@@ -159,9 +159,10 @@ def test_a_crop_needs_the_image_size_of_the_calibration(tmp_path, crop, shape):
 def test_several_processes_give_the_results_of_one(recording, tmp_path):
     single, _ = measure_instant(recording, processes=1)
     several, _ = measure_instant(recording, processes=2)
-    assert torch.equal(several.displacement, single.displacement)
+    torch.testing.assert_close(several.displacement, single.displacement, rtol=0, atol=0, equal_nan=True)
     film = measure_recording(recording, range(3), [0.0, 1.0, 2.0], tmp_path / "film.zarr", processes=2)
-    assert torch.equal(film.frame(0).displacement, single.displacement)
+    measured = single.displacement.isfinite()  # NaN where only the images are valid, which a film does not have
+    assert torch.equal(film.frame(0).displacement[measured], single.displacement[measured])
     assert all(film.is_written(i) for i in range(3))
 
 

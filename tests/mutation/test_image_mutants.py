@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from imaging_files import CIHX, packed, write_cv
+from imaging_files import CIHX, packed, write_b16, write_cv, write_dng, write_packed_tiff
 from mutation.mutators import spoil_bytes, spoil_text
 from nerif.common.conventions import InputError
 from nerif.imaging.readers.frames import Frames
@@ -56,12 +56,35 @@ def photron(path: Path) -> None:
     path.with_suffix(".mraw").write_bytes(packed(STACK))
 
 
+def cine(path: Path) -> None:
+    frames = [packed(image, 10) for image in STACK >> 2]
+    write_cine(path, frames, *STACK.shape[1:], bits=10, packing=256, times=(0.0, 0.001, 0.002))
+
+
 def hdf5(path: Path) -> None:
     import h5py
 
     with h5py.File(path, "w") as file:
         file["images"] = STACK
         file["time"] = np.arange(3) / 2000
+
+
+def video(codec: str, pixels: str) -> Callable[[Path], None]:
+    def write(path: Path) -> None:
+        av = pytest.importorskip("av", reason="pip install '.[video]'")
+        with av.open(str(path), "w") as file:
+            stream = file.add_stream(codec, rate=30)
+            stream.height, stream.width, stream.pix_fmt = 32, 48, pixels
+            for image in np.random.default_rng(4).integers(0, 256, (3, 32, 48)).astype(np.uint8):
+                file.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="gray").reformat(format=pixels)))
+            file.mux(stream.encode())
+
+    return write
+
+
+def dng(path: Path) -> None:
+    pytest.importorskip("rawpy", reason="pip install '.[raw]'")
+    write_dng(path, np.random.default_rng(5).integers(0, 4096, (48, 64)).astype(np.uint16), b"\0\1\1\2", 64, 4095)
 
 
 KINDS: dict[str, Callable[[Path], None]] = {
@@ -73,6 +96,12 @@ KINDS: dict[str, Callable[[Path], None]] = {
     "grey.bmp": picture,
     "grey.jpg": picture,
     "film.cihx": photron,
+    "packed.tif": lambda path: write_packed_tiff(path, STACK >> 2, 10, 5),
+    "film.cine": cine,
+    "film.avi": video("rawvideo", "gray"),
+    "film.mp4": video("libx264", "yuv420p"),
+    "image.b16": lambda path: write_b16(path, STACK[0]),
+    "image.dng": dng,
     "stack.npy": lambda path: np.save(path, STACK),
     "stack.npz": lambda path: np.savez(path, images=STACK),
     "stack.h5": hdf5,

@@ -25,6 +25,7 @@ from nerif.report.isosurface import default_level, draw_isosurface, stl_of, surf
 from nerif.report.pages import JOURNALS, figures_of, residuals_over_sigma, slices, view
 from nerif.report.slice_images import bar_image, slice_aspect, slice_image
 from nerif.results.directory import Result, ResultDirectory
+from nerif.results.metrics import Metrics
 
 GRID = Grid(Box((-5.0, -4.0, -3.0), (5.0, 4.0, 3.0)), (12, 16, 20))
 
@@ -172,7 +173,7 @@ def test_names_of_views_become_names_of_files(whole):
     scores = {"withheld": False, "cc": 0.9, "rms": 0.1, "measured": "displacement", "unit": "px"}
     renamed = Result(
         whole,
-        metrics={"views": [{"name": name, **scores} for name in names]},
+        metrics=Metrics(views=[{"name": name, **scores} for name in names]),
         reprojection=replace(result.reprojection, measurement=replace(m, cameras=cameras)),
     )
     files = []
