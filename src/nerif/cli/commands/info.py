@@ -18,6 +18,7 @@ from nerif.common.conventions import InputError, with_unit
 from nerif.common.netcdf import opened
 from nerif.data.measurement import Measurement
 from nerif.data.measurement_file import known_conventions
+from nerif.data.measurement_sequence import MeasurementSequence
 from nerif.data.volume import INDEX, Volume, name_of
 from nerif.data.volume_file import read_volume
 from nerif.forward.registry import TECHNIQUES
@@ -29,16 +30,18 @@ __all__ = ["Info", "is_measurement", "main", "run"]
 
 @dataclass(frozen=True)
 class Info(Settings):
-    """Describe a measurement, a volume or a result directory."""
+    """Describe a measurement, a measurement over time, a volume or a result directory."""
 
     path: Annotated[Path, tyro.conf.Positional]
-    """Measurement (.nc), volume (.nc, .vti) or result directory."""
+    """Measurement (.nc; over time .zarr), volume (.nc, .vti) or result directory."""
 
 
 def run(settings: Info) -> None:
     """Print the description."""
     path = settings.path
-    if path.is_dir():
+    if path.is_dir() and path.suffix == ".zarr":
+        _film(path, MeasurementSequence.read(path))
+    elif path.is_dir():
         _result(path)
     elif path.suffix == ".vti" or (path.suffix == ".nc" and path.is_file() and not is_measurement(path)):
         _volume(path, read_volume(path))
@@ -63,6 +66,15 @@ def _corners(lower: tuple[float, ...], upper: tuple[float, ...]) -> str:
 
 def _rms(values: Tensor, unit: str) -> str:
     return with_unit(f"{float(values.square().mean().sqrt()):.4g}", unit)
+
+
+def _film(path: Path, film: MeasurementSequence) -> None:
+    written = sum(map(film.is_written, range(len(film))))
+    times = f"{film.times[0]:g} to {film.times[-1]:g} s"
+    say(
+        f"{path}: measurement over time, {len(film)} instants from {times}, {written} of them written; the first complete one:"
+    )
+    _measurement(path, film.fullest())
 
 
 def _measurement(path: Path, m: Measurement) -> None:
@@ -90,6 +102,8 @@ def _measurement(path: Path, m: Measurement) -> None:
     if sigmas:
         turn, shift = (float(torch.stack(sigmas)[:, part].square().mean().sqrt()) for part in (slice(3), slice(3, 6)))
         say(f"  pose_sigma     {math.degrees(turn):.2g} deg, {shift:.2g} mm (for --refine cameras)")
+    for name, offset in m.frame_offsets.items():
+        say(f"  frame offset   {name} {offset:+d}")
     say(f"  flow mask      {'yes' if m.flow_mask is not None else 'no'}")
     columns = "".join(f"{f'rms {o.label}':>24}" for o in m.observations)
     say(f"  view            size [px]  pixel [mm]   centre to camera [mm]   to background [mm]   usable{columns}")
