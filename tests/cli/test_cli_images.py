@@ -296,7 +296,7 @@ def test_several_flow_images_become_a_sequence(copy, capsys, refusal):
     capsys.readouterr()
     assert run("info", copy / "film.zarr") == 0
     lines = capsys.readouterr().out
-    assert "measurement over time, 1 instants" in lines
+    assert "measurement over time, 1 of 1 instants written" in lines
     assert f"frame offset   {first} -1" in lines
     assert f"frame offset   {second} +1" in lines
 

@@ -70,10 +70,8 @@ def _rms(values: Tensor, unit: str) -> str:
 
 def _film(path: Path, film: MeasurementSequence) -> None:
     written = sum(map(film.is_written, range(len(film))))
-    times = f"{film.times[0]:g} to {film.times[-1]:g} s"
-    say(
-        f"{path}: measurement over time, {len(film)} instants from {times}, {written} of them written; the first complete one:"
-    )
+    say(f"{path}: measurement over time, {written} of {len(film)} instants written")
+    say(f"  times          {film.times[0]:g} to {film.times[-1]:g} s")
     _measurement(path, film.fullest())
 
 

@@ -95,10 +95,11 @@ class View:
         """Raise an InputError that names a parameter, unless the view has a flow image of all these instants."""
         if min(numbers) in self.instants and max(numbers) in self.instants:
             return
+        got = words_of_range(range(min(numbers), max(numbers) + 1))
         offset = f", frame offset {self.frame_offset}" if self.frame_offset else ""
         raise InputError(
             f"expected numbers within {words_of_range(self.instants)}, those of view '{self.name}' "
-            f"({len(self.open('flow'))} flow images{offset}), got {words_of_range(range(min(numbers), max(numbers) + 1))}",
+            f"({len(self.open('flow'))} flow images{offset}), got {got}",
             field=parameter,
         )
 
