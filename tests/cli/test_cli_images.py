@@ -155,6 +155,8 @@ def test_without_any_valid_view_the_old_measurement_stays(copy, refusal):
         ("--frame -1", "frame: "),
         ("--method piv", "--method"),
         ("--views none", "views: "),
+        ("--frame-offset none 1", "frame_offset: expected some of"),
+        ("--frame-offset none", "--frame-offset"),
         ("--average 0", "average: expected 1 or more"),
         ("--frames all", "out: expected a name ending in .zarr"),
     ],
@@ -285,7 +287,18 @@ def test_several_flow_images_become_a_sequence(copy, capsys, refusal):
     assert run(*words) == 0  # nothing is left to do
     for change in ("--smoothness 2", "--mask 4", "--n-ambient 1.0003"):
         assert "other settings" in refusal(*words, *change.split())
-    assert "3 of view" in refusal(*words, "--frames", "0:4")
+    assert "expected numbers within 0 to 2, those of view" in refusal(*words, "--frames", "0:4")
+    first, second = (view.name for view in views[:2])
+    offsets = ["--frame-offset", first, "-1", "--frame-offset", second, "1"]
+    assert "other settings" in refusal(*words, *offsets)
+    assert run(*words, "--force", *offsets) == 0
+    assert MeasurementSequence.read(copy / "film.zarr").times == pytest.approx([1e-3])
+    capsys.readouterr()
+    assert run("info", copy / "film.zarr") == 0
+    lines = capsys.readouterr().out
+    assert "measurement over time, 1 of 1 instants written" in lines
+    assert f"frame offset   {first} -1" in lines
+    assert f"frame offset   {second} +1" in lines
 
 
 def test_flow_images_of_another_bit_depth_are_refused_in_sequences(copy, capsys, refusal):

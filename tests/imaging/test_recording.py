@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
+import pickle
 from collections import Counter
 from dataclasses import replace
 
@@ -14,6 +15,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 
 from imaging_files import write_cine
 from nerif.common.conventions import InputError
+from nerif.data.measurement import Measurement
 from nerif.geometry import Box, Lens, Plane, Ring
 from nerif.imaging import workers
 from nerif.imaging.calibration.cameras_file import CalibratedCamera
@@ -22,7 +24,7 @@ from nerif.imaging.masks import MaskSettings
 from nerif.imaging.readers.crop import Crop
 from nerif.imaging.readers.views import View, find_views
 from nerif.imaging.recording import Recording, Scene, ViewReference, camera_of, measure_instant
-from nerif.imaging.recording_sequence import measure_recording
+from nerif.imaging.recording_sequence import frame_numbers, instants_of, measure_recording
 from refusals import refused
 
 SHAPE = (60, 72)
@@ -67,7 +69,9 @@ def test_views_that_cannot_be_used_are_left_out(recording, lines):
     measurement, _ = measure_instant(replace(recording, cameras=cameras), (2,), lines.append)
     assert measurement.names == ("120deg",)
     assert any("'0deg' left out: view '0deg': its camera has no background plane" in line for line in lines)
-    assert any("'60deg' left out" in line and "1 flow images" in line for line in lines)
+    assert any(
+        "'60deg' left out" in line and "within 0 to 0, those of view '60deg' (1 flow images)" in line for line in lines
+    )
     del cameras["0deg"]
     with refused("calibration"):
         replace(recording, cameras=cameras)
@@ -95,6 +99,49 @@ def test_a_sequence_of_one_frame_equals_the_measurement(recording, tmp_path):
     assert frame.names == single.names
     for name in ("displacement", "sigma", "valid"):
         assert torch.equal(getattr(frame, name).nan_to_num(), getattr(single, name).nan_to_num()), name
+
+
+def test_instant_i_is_flow_image_i_plus_the_offset_of_the_view(recording, tmp_path):
+    offsets = {"60deg": -2, "120deg": 1}
+    shifted = replace(recording, views=find_views(tmp_path, frame_offsets=offsets))
+    one = replace(shifted, views=shifted.views[:2], images=False)
+    numbers = frame_numbers("all", one.views)
+    assert numbers == range(2, 3)  # of three flow images each
+    assert instants_of(numbers, one.views[1], 10.0) == (0.2,)
+    plain = [measure_instant(replace(recording, images=False), (i,))[0].displacement for i in range(3)]
+    assert not torch.equal(plain[0].nan_to_num(), plain[2].nan_to_num())
+    single, _ = measure_instant(one, numbers)
+    film = measure_recording(one, numbers, [0.2], tmp_path / "film.zarr")
+    for measurement in (single, film.frame(0)):
+        assert measurement.frame_offsets.get("60deg") == -2
+        assert torch.equal(measurement.displacement[0].nan_to_num(), plain[2][0].nan_to_num())
+        assert torch.equal(measurement.displacement[1].nan_to_num(), plain[0][1].nan_to_num())
+    single.write(tmp_path / "m.nc")
+    read = Measurement.read(tmp_path / "m.nc")
+    assert read.frame_offsets == {"60deg": -2}
+    assert read.select(["0deg"]).frame_offsets.get("0deg", 0) == 0
+    with pytest.raises(InputError, match="other settings; give another --out, or --force"):
+        measure_recording(replace(one, views=recording.views[:2]), numbers, [0.2], tmp_path / "film.zarr")
+
+
+def test_instants_without_a_flow_image_in_some_view_are_refused(recording, tmp_path, lines):
+    views = find_views(tmp_path, frame_offsets={"60deg": -2, "120deg": 1})
+    with pytest.raises(InputError, match=r"got none in common \(0deg 0 to 2, 60deg 2 to 4, 120deg 0 to 1\)"):
+        frame_numbers("all", views)
+    with pytest.raises(
+        InputError, match=r"within 2 to 4, those of view '60deg' \(3 flow images, frame offset -2\), got 1 to 2"
+    ):
+        frame_numbers("1:3", views)
+    measurement, _ = measure_instant(replace(recording, views=views), (1,), lines.append)
+    assert measurement.names == ("0deg", "120deg")
+    assert any("'60deg' left out: frame, average: expected numbers within 2 to 4" in line for line in lines)
+    with refused("frame_offset"):
+        find_views(tmp_path, frame_offsets={"61deg": 1})
+    view = find_views(tmp_path, ["60deg"], {"60deg": 9})[0]
+    assert not view.instants
+    with pytest.raises(InputError, match="within none, those of view '60deg'"):
+        view.check_instants([0], "frames")
+    assert pickle.loads(pickle.dumps(view)) == view  # for another process
 
 
 OTHER = {
@@ -159,10 +206,10 @@ def test_a_crop_needs_the_image_size_of_the_calibration(tmp_path, crop, shape):
 def test_several_processes_give_the_results_of_one(recording, tmp_path):
     single, _ = measure_instant(recording, processes=1)
     several, _ = measure_instant(recording, processes=2)
-    torch.testing.assert_close(several.displacement, single.displacement, rtol=0, atol=0, equal_nan=True)
+    assert torch.equal(several.displacement.nan_to_num(), single.displacement.nan_to_num())
     film = measure_recording(recording, range(3), [0.0, 1.0, 2.0], tmp_path / "film.zarr", processes=2)
-    measured = single.displacement.isfinite()  # NaN where only the images are valid, which a film does not have
-    assert torch.equal(film.frame(0).displacement[measured], single.displacement[measured])
+    single, _ = measure_instant(replace(recording, images=False), processes=1)
+    assert torch.equal(film.frame(0).displacement.nan_to_num(), single.displacement.nan_to_num())
     assert all(film.is_written(i) for i in range(3))
 
 

@@ -73,12 +73,31 @@ def test_crops_of_a_shared_sensor(folder, lines):
 
 
 @pytest.mark.parametrize(
-    "text", ["[views.a]\nrefrence = 'x'\n", "[views.a]\nrow = 'x'\n", "views = 3\n", "[views.a\n", "reference = 'x'\n"]
+    "text",
+    [
+        "[views.a]\nrefrence = 'x'\n",
+        "[views.a]\nrow = 'x'\n",
+        "[views.a]\nframe_offset = 1.5\n",
+        "views = 3\n",
+        "[views.a\n",
+        "reference = 'x'\n",
+    ],
 )
 def test_invalid_views_file(folder, text):
     (folder / "views.toml").write_text(text)
     with refused(folder if text.startswith("reference") else folder / "views.toml"):
         find_views(folder)
+
+
+def test_frame_offsets_of_the_file_are_read_and_overridden(folder):
+    (folder / "views.toml").write_text(
+        'flow = "cam2/flow"\nreference = "cam2/reference"\n[views.a]\nframe_offset = -2\n[views.b]\n'
+    )
+    assert [view.frame_offset for view in find_views(folder)] == [-2, 0]
+    assert [view.frame_offset for view in find_views(folder, frame_offsets={"b": 3})] == [-2, 3]
+    assert [view.frame_offset for view in find_views(folder, frame_offsets={"a": 0})] == [0, 0]
+    write_crops(folder, {"a": Crop(row=1)})
+    assert find_views(folder)[0].frame_offset == -2
 
 
 def test_crops_are_written_for_folders_and_read_again(folder):

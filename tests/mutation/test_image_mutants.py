@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from imaging_files import CIHX, packed, write_b16, write_cv, write_dng, write_packed_tiff
+from imaging_files import CIHX, packed, write_b16, write_cine, write_cv, write_dng, write_packed_tiff
 from mutation.mutators import spoil_bytes, spoil_text
 from nerif.common.conventions import InputError
 from nerif.imaging.readers.frames import Frames

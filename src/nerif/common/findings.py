@@ -20,6 +20,7 @@ class Finding:
         One view: swapped, flipped, flipped_u, flipped_v, mirrored, upside_down, turned, transposed, quarter_turn,
         reversed_columns, reversed_rows, reversed_axes, exchanged, misscaled, unlike.
         Flow: open_face
+        Film: late
     sentence : description and remedy
     views : names of the views concerned; empty for the whole measurement
     """

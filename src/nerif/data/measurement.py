@@ -150,6 +150,7 @@ class Measurement:
     ambient_faces : faces of the box with ambient index (the gauge)
     maps : (view, row, column) or (view, row, column, c) of other techniques, by their names in the file, such as
         absorbance and absorbance_sigma; NaN: no data
+    frame_offsets : by the names of views: instant i is frame i + offset of the view's film; 0 if not named
 
     Raises
     ------
@@ -168,6 +169,7 @@ class Measurement:
     wavelength_nm: float | None = None
     ambient_faces: tuple[str, ...] = DEFAULT_AMBIENT_FACES
     maps: Mapping[str, Float[Tensor, "view row column *c"]] = field(default_factory=dict)
+    frame_offsets: Mapping[str, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self._check_maps()

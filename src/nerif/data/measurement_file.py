@@ -47,6 +47,7 @@ RIG = {
     "focus_distance": (("view",), "mm"),
     "window": (("view",), "px"),
     "pose_sigma": (("view", "parameter"), "rad rad rad mm mm mm"),
+    "frame_offset": (("view",), "1"),
 }
 """Dimensions and units of masks and of the variables of the rig."""
 MASKS = ("valid", "flow_mask")
@@ -122,6 +123,9 @@ def to_dataset(measurement: Measurement) -> xr.Dataset:
     if any(c.pose_sigma is not None for c in cameras):
         none = torch.full((6,), torch.nan, dtype=torch.float64)
         data["pose_sigma"] = stack([none if c.pose_sigma is None else c.pose_sigma for c in cameras])
+    frame_offsets = np.array([measurement.frame_offsets.get(name, 0) for name in measurement.names], dtype=np.int32)
+    if frame_offsets.any():
+        data["frame_offset"] = frame_offsets
     for name, value in {**measurement.all_maps, **{name: getattr(measurement, name) for name in MASKS}}.items():
         if value is not None:
             data[name] = (value.view(torch.int8) if value.dtype == torch.bool else value.float()).numpy()
@@ -134,7 +138,8 @@ def to_dataset(measurement: Measurement) -> xr.Dataset:
         dataset = dataset.assign_coords(component=list(COMPONENTS))
     names = [kind.name for kind in measurement.techniques]
     pinholes = all(c.projection == PERSPECTIVE for c in cameras)
-    plain = names == [Deflection.name] and pinholes and not lenses and not data.keys() & {"pose_sigma", "tilt"}
+    more = data.keys() & {"pose_sigma", "tilt", "frame_offset"}
+    plain = names == [Deflection.name] and pinholes and not lenses and not more
     dataset.attrs = {
         "Conventions": PLAIN if plain else CONVENTIONS,
         **({} if plain else {"technique": " ".join(names)}),
@@ -176,7 +181,15 @@ def from_dataset(dataset: xr.Dataset) -> dict[str, Any]:
         "n_ambient": _number(dataset, "n_ambient", "the ambient index, e.g. 1.00027", None if index else 1.0),
         "wavelength_nm": _number(dataset, "wavelength_nm", "nm") if "wavelength_nm" in dataset.attrs else None,
         "ambient_faces": parse_faces(faces, "attribute ambient_faces"),
+        "frame_offsets": _frame_offsets(dataset),
     }
+
+
+def _frame_offsets(dataset: xr.Dataset) -> dict[str, int]:
+    """Return the frame offsets by the names of views."""
+    names = _names(dataset)
+    offsets = _optional(dataset, "frame_offset", (len(names),), 0.0).tolist()
+    return {name: int(offset) for name, offset in zip(names, offsets, strict=True) if offset}
 
 
 def _techniques(dataset: xr.Dataset) -> tuple[type[ForwardModel], ...]:

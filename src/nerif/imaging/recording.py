@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import torch
@@ -28,14 +28,21 @@ from nerif.imaging.workers import cores, work
 __all__ = ["Recording", "Scene", "Surroundings", "ViewReference", "camera_of", "join_views", "measure_instant"]
 
 PixelMask = Bool[np.ndarray, "row column"]
-ViewMeasurement = tuple[Camera, DisplacementMap, PixelMask | None]
-"""Camera, displacement and flow mask (or None) of a view."""
 
 WORTH_PROCESSES = 2**22  # pixels of all images together
 
 
 def silent(line: str) -> None:
     """Report nothing."""
+
+
+class ViewMeasurement(NamedTuple):
+    """Camera, displacement, flow mask and frame offset of a view."""
+
+    camera: Camera
+    result: DisplacementMap
+    mask: PixelMask | None
+    frame_offset: int = 0
 
 
 @dataclass(frozen=True)
@@ -70,9 +77,11 @@ def join_views(views: Iterable[ViewMeasurement], scene: Scene, images: bool = Fa
     """
     cameras: list[Camera] = []
     maps: dict[str, list[np.ndarray]] = {}
+    frame_offsets: dict[str, int] = {}
     any_mask = False
-    for camera, result, mask in views:
+    for camera, result, mask, frame_offset in views:
         cameras.append(camera)
+        frame_offsets[camera.name] = frame_offset
         any_mask |= mask is not None
         arrays = {"displacement": result.displacement, "sigma": result.sigma, "valid": result.valid}
         arrays["flow_mask"] = np.ones(result.valid.shape, dtype=bool) if mask is None else mask
@@ -104,6 +113,7 @@ def join_views(views: Iterable[ViewMeasurement], scene: Scene, images: bool = Fa
         flow_mask=stack("flow_mask") if any_mask else None,
         wavelength_nm=scene.surroundings.wavelength_nm,
         ambient_faces=scene.surroundings.ambient_faces,
+        frame_offsets=frame_offsets,
     )
 
 
@@ -189,11 +199,10 @@ class ViewReference:
         return cls(view, camera, reference, recording.masks, region, drawn_mask, recording.images)
 
     def measure(self, numbers: Sequence[int], say: Callable[[str], None] = silent) -> ViewMeasurement:
-        """Return camera, mean displacement over flow images of these numbers, and flow mask."""
-        frames, images = self.view.open("flow"), []
-        for i in numbers:
-            images.append(self.view.cropped(frames[i], frames.name(i)))
-            if exposure := check_exposure(images[-1], self.reference.full_scale, frames.name(i)):
+        """Return camera, mean displacement over the flow images of these instants, and flow mask."""
+        images, names = zip(*(self.view.flow_image(i) for i in numbers), strict=True)
+        for image, name in zip(images, names, strict=True):
+            if exposure := check_exposure(image, self.reference.full_scale, name):
                 say(f"note: {exposure}")
         result = self.reference.measure(images, self.region, self.images)
         if not result.valid.any():
@@ -201,13 +210,13 @@ class ViewReference:
             raise InputError(
                 f"no valid pixel (noise above {method.max_sigma:g} px or correlation below "
                 f"{method.min_correlation:g} everywhere); do the images show the same pattern, in focus?",
-                field=frames.name(numbers[0]),
+                field=names[0],
             )
         mask = self.drawn_mask
         if mask is None and self.masks is not None:
             d = np.where(result.valid[..., None], result.displacement, np.nan)
             mask = flow_mask(d, result.sigma, self.masks)
-        return self.camera, result, mask
+        return ViewMeasurement(self.camera, result, mask, self.view.frame_offset)
 
 
 def camera_of(view: View, calibrated: CalibratedCamera, shape: tuple[int, int]) -> Camera:
@@ -259,7 +268,7 @@ def measure_instant(
 
     Parameters
     ----------
-    numbers : of the flow images, whose displacements are averaged
+    numbers : of the instants, whose displacements are averaged
     say : called with a line about each view and image that is left out
     on_view : called with the number of views evaluated
     processes : 1 for this one only; by default one per core if the images are large
@@ -294,13 +303,7 @@ def _measure_view(
     view, numbers = task
     lines: list[str] = []
     try:
-        count = len(view.open("flow"))
-        if not 0 <= min(numbers) <= max(numbers) < count:
-            raise InputError(
-                f"expected numbers within the {count} flow images of view '{view.name}', got "
-                f"{min(numbers)} to {max(numbers)}",
-                field="frame, average",
-            )
+        view.check_instants(numbers, "frame, average")
         return ViewReference.of(recording, view, len(numbers), lines.append).measure(numbers, lines.append), lines
     except InputError as error:
         return error, lines

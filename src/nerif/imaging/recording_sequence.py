@@ -16,7 +16,7 @@ from nerif.data.measurement import Measurement
 from nerif.data.measurement_file import from_dataset
 from nerif.data.measurement_sequence import MeasurementSequence
 from nerif.geometry import Camera, Lens
-from nerif.imaging.readers.views import View
+from nerif.imaging.readers.views import OFFSET, View, words_of_range
 from nerif.imaging.recording import Recording, Scene, ViewReference, join_views, silent
 from nerif.imaging.workers import work
 
@@ -55,7 +55,7 @@ def _reference(recording: Recording, view: View) -> tuple[ViewReference | InputE
 
 
 def measure_frame(references: Sequence[ViewReference], scene: Scene, number: int) -> tuple[Measurement, list[str]]:
-    """Return the measurement of one flow image, and the errors of the views that are left out."""
+    """Return the measurement of one instant, and the errors of the views that are left out."""
     results, errors = [], []
     for reference in references:
         try:
@@ -68,32 +68,36 @@ def measure_frame(references: Sequence[ViewReference], scene: Scene, number: int
 
 
 def frame_numbers(text: str, views: Sequence[View]) -> range:
-    """Return the flow images of "all" or FIRST:LAST (LAST excluded), which every view must have."""
-    counts = {view.name: len(view.open("flow")) for view in views}
-    shortest = min(counts, key=lambda name: counts[name])
+    """Return the instants of "all" or FIRST:LAST (LAST excluded), of which every view must have a flow image."""
     if text == "all":
-        return range(counts[shortest])
+        common = range(max(view.instants.start for view in views), min(view.instants.stop for view in views))
+        if not common:
+            ranges = ", ".join(f"{view.name} {words_of_range(view.instants)}" for view in views)
+            raise InputError(
+                f"expected instants of which every view has a flow image, got none in common ({ranges}); correct the "
+                "frame offsets, or choose --views",
+                field="frames",
+            )
+        return common
     try:
         first, last = (int(word) for word in text.split(":"))
         if not 0 <= first < last:
             raise ValueError
     except ValueError:
         raise InputError(f"expected all, or FIRST:LAST such as 0:400, got '{text}'", field="frames") from None
-    if last > counts[shortest]:
-        raise InputError(
-            f"expected numbers within the {counts[shortest]} of view '{shortest}', got '{text}'", field="frames"
-        )
+    for view in views:
+        view.check_instants(range(first, last), "frames")
     return range(first, last)
 
 
 def instants_of(numbers: range, view: View, frame_rate: float) -> tuple[float, ...]:
-    """Return the times of frames, s, by the frame rate (1/s) or, if it is 0, by the recording."""
+    """Return the times of instants, s, by the frame rate (1/s) or, if it is 0, by the recording of a view."""
     if frame_rate > 0:
         return tuple(i / frame_rate for i in numbers)
-    times = view.open("flow").times
-    if times is None:
+    times = [time for i in numbers if (time := view.flow_time(i)) is not None]
+    if not times:
         raise InputError("expected frames per second, as the images have no times; got none", field="frame_rate")
-    return tuple(float(times[i]) for i in numbers)
+    return tuple(times)
 
 
 def measure_recording(
@@ -111,16 +115,18 @@ def measure_recording(
 
     Parameters
     ----------
-    numbers : of the flow images
+    numbers : of the instants; a view's flow image is that number plus its frame offset
     times : of these, s
     out : Zarr store, created if it does not exist
-    settings : written to the store; a store with other settings or cameras is not continued
+    settings : written to the store; a store with other settings, frame offsets or cameras is not continued
     force : replace the store
     say : called with a line about everything that is left out
     on_step : called with the number of views with evaluated references plus that of finished frames
     processes : 1 for this one only; by default one per core if the images are large
     """
-    settings = json.loads(json.dumps({**(settings or {}), "frames": [numbers.start, numbers.stop]}, default=str))
+    offsets = {view.name: view.frame_offset for view in recording.views if view.frame_offset}
+    settings = {**(settings or {}), "frames": [numbers.start, numbers.stop], **({OFFSET: offsets} if offsets else {})}
+    settings = json.loads(json.dumps(settings, default=str))
     sequence = _existing(out, settings) if out.exists() and not force else None
     references = references_of(recording, say, on_step, processes)
     if sequence is not None:

@@ -22,7 +22,7 @@ from nerif.imaging.recording import measure_instant
 
 __all__ = ["PAGE"]
 
-BY_PAGE = ("config", "folder", "calibration", "out", "frames", "frame_rate")
+BY_PAGE = ("config", "folder", "calibration", "out", "frames", "frame_rate", "frame_offset")
 MAIN = ("method", "smoothness", "lower", "upper", "max_sigma", "min_correlation", "shake_border", "images")
 
 

@@ -10,12 +10,15 @@ import tyro
 from annotated_types import Ge
 
 from nerif.analysis.consistency import Consistency, check_consistency, corrected
+from nerif.analysis.film_check import check_film
 from nerif.analysis.rig_check import RigCheck, check_rig
 from nerif.cli.commands.output import MONITOR, check_output, counting_bar, say
 from nerif.cli.commands.settings import Settings
 from nerif.common.conventions import InputError
+from nerif.common.files import ending
 from nerif.common.settings import Positive
 from nerif.data.measurement import Measurement
+from nerif.data.measurement_sequence import MeasurementSequence
 from nerif.reconstruction.shared_settings import Aperture
 
 __all__ = ["Check", "main", "run"]
@@ -28,10 +31,13 @@ class Check(Settings):
     Detected: swapped u and v, flipped sign, mirrored, reversed or rotated images, of one view or all; two exchanged
     views; wrong scale; flow that leaves the box through a face. Not detectable: a flipped sign of all views (the sign
     of the flow is reported) and mirrored images of a symmetric flow. Techniques are checked separately.
+
+    Of a measurement over time, views whose films are some frames late or early are named, with the remedy; the views
+    are then compared at one instant.
     """
 
     measurement: tyro.conf.Positional[Path]
-    """Measurement file."""
+    """Measurement file (.nc), or measurement over time (.zarr)."""
     voxels: Annotated[int, Ge(8)] = 24
     """Voxels of the quick reconstructions along the longest edge of the box."""
     aperture: Aperture = "auto"
@@ -59,8 +65,11 @@ def run(settings: Check) -> Consistency | RigCheck:
         if settings.refine:
             raise InputError("expected none with --refine, which corrects nothing; leave one out", field="out")
         check_output(settings.out, settings.force, endings=(".nc",))
-    measurement = Measurement.read(settings.measurement)
-    result = _rig(settings, measurement) if settings.refine else _views(settings, measurement)
+    film = MeasurementSequence.read(settings.measurement) if ending(settings.measurement) == ".zarr" else None
+    if film is not None and settings.out is not None:
+        raise InputError("expected none for a measurement over time, which is not corrected; leave it out", field="out")
+    measurement = film.fullest() if film is not None else Measurement.read(settings.measurement)
+    result = _rig(settings, measurement) if settings.refine else _views(settings, film or measurement)
     for remark in result.remarks:
         say(f"note: {remark}")
     for finding in result.findings:
@@ -88,9 +97,12 @@ def _rig(settings: Check, measurement: Measurement) -> RigCheck:
     return result
 
 
-def _views(settings: Check, measurement: Measurement) -> Consistency:
+def _views(settings: Check, measurement: Measurement | MeasurementSequence) -> Consistency:
     with counting_bar("comparing views") as bar:
-        result = check_consistency(measurement, settings.voxels, bar, settings.aperture)
+        if isinstance(measurement, MeasurementSequence):
+            result = check_film(measurement, settings.voxels, bar, settings.aperture)
+        else:
+            result = check_consistency(measurement, settings.voxels, bar, settings.aperture)
     head = "map           " if len({view.measured for view in result.views}) > 1 else ""
     if result.views:
         say(f"{'view':<14}{head}{'valid':>8}{'agreement':>11}{'gain':>7}")

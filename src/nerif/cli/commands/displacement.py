@@ -28,6 +28,8 @@ from nerif.imaging.recording_sequence import frame_numbers, instants_of, measure
 
 __all__ = ["Displacement", "main", "run"]
 
+UNRECORDED = ("out", "force", "config", "frames", "frame_offset")  # or recorded by measure_recording
+
 
 @dataclass(frozen=True)
 class Displacement(Settings):
@@ -54,6 +56,9 @@ class Displacement(Settings):
     """Number of the flow image."""
     frames: str = ""
     """Flow images of a sequence: all, or FIRST:LAST (LAST excluded); requires --out NAME.zarr."""
+    frame_offset: tyro.conf.UseAppendAction[dict[str, int]] = field(default_factory=dict)
+    """View and offset of its film, such as cam3 -2: number i is flow image i - 2 of cam3. Once for each view; replaces
+    frame_offset of views.toml."""
     frame_rate: float = 0.0
     """Flow images per second (0: from the recording)."""
     average: Count = 1
@@ -73,7 +78,7 @@ class Displacement(Settings):
         """Return images, cameras and box."""
         from nerif.imaging.calibration.importers.importers import import_box, import_cameras
 
-        views = find_views(self.folder, self.views)
+        views = find_views(self.folder, self.views, self.frame_offset)
         cameras = {c.name: c for c in import_cameras(self.calibration)}
         box = Box.between(self.lower, self.upper) or import_box(self.calibration)
         if box is None:
@@ -116,7 +121,7 @@ def _run_over_time(settings: Displacement, recording: Recording) -> MeasurementS
         raise InputError("expected none with --frames, which selects the flow images", field="frame, average")
     numbers = frame_numbers(settings.frames, recording.views)
     times = instants_of(numbers, recording.views[0], settings.frame_rate)
-    attributes = {k: v for k, v in asdict(settings).items() if k not in ("out", "force", "config", "frames")}
+    attributes = {k: v for k, v in asdict(settings).items() if k not in UNRECORDED}
     remedy = f"complete frames are kept in {settings.out}; run the same command again to continue"
     count = len(recording.views) + len(numbers)
     with if_interrupted(lambda: remedy), counting_bar("references, then frames", count) as bar:

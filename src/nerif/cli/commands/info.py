@@ -15,8 +15,9 @@ from nerif.analysis.evaluation import rms_with_unit
 from nerif.cli.commands.output import say
 from nerif.cli.commands.settings import Settings, command
 from nerif.common.conventions import with_unit
-from nerif.data.kinds import MEASUREMENT, RESULT, VOLUME, check_kind, kind_of
+from nerif.data.kinds import MEASUREMENT, RESULT, SEQUENCE, VOLUME, check_kind, kind_of
 from nerif.data.measurement import Measurement
+from nerif.data.measurement_sequence import MeasurementSequence
 from nerif.data.measurement_summary import valid_pixels
 from nerif.data.volume import INDEX, Volume, name_of
 from nerif.data.volume_file import read_volume
@@ -28,17 +29,19 @@ __all__ = ["Info", "main", "run"]
 
 @dataclass(frozen=True)
 class Info(Settings):
-    """Describe a measurement, a volume or a result directory."""
+    """Describe a measurement, a measurement over time, a volume or a result directory."""
 
     path: Annotated[Path, tyro.conf.Positional]
-    """Measurement (.nc), volume (.nc, .vti) or result directory."""
+    """Measurement (.nc; over time .zarr), volume (.nc, .vti) or result directory."""
 
 
 def run(settings: Info) -> None:
     """Print the description."""
     path = settings.path
-    check_kind(path, MEASUREMENT, VOLUME, RESULT)
-    if path.is_dir():
+    check_kind(path, MEASUREMENT, VOLUME, RESULT, SEQUENCE)
+    if kind_of(path) is SEQUENCE:
+        _film(path, MeasurementSequence.read(path))
+    elif path.is_dir():
         _result(path)
     elif kind_of(path) is VOLUME:
         _volume(path, read_volume(path))
@@ -52,6 +55,13 @@ def _corners(lower: tuple[float, ...], upper: tuple[float, ...]) -> str:
 
 def _rms(values: Tensor, unit: str) -> str:
     return with_unit(f"{float(values.square().mean().sqrt()):.4g}", unit)
+
+
+def _film(path: Path, film: MeasurementSequence) -> None:
+    written = sum(map(film.is_written, range(len(film))))
+    say(f"{path}: measurement over time, {written} of {len(film)} instants written")
+    say(f"  times          {film.times[0]:g} to {film.times[-1]:g} s")
+    _measurement(path, film.fullest())
 
 
 def _measurement(path: Path, m: Measurement) -> None:
@@ -82,6 +92,8 @@ def _measurement(path: Path, m: Measurement) -> None:
     if sigmas:
         turn, shift = (float(torch.stack(sigmas)[:, part].square().mean().sqrt()) for part in (slice(3), slice(3, 6)))
         say(f"  pose_sigma     {math.degrees(turn):.2g} deg, {shift:.2g} mm (for --refine cameras)")
+    for name, offset in m.frame_offsets.items():
+        say(f"  frame offset   {name} {offset:+d}")
     say(f"  flow mask      {'yes' if m.flow_mask is not None else 'no'}")
     say(f"  valid pixels   {valid_pixels(m)}")
     columns = "".join(f"{f'valid {o.technique.data_name()}':>20}{f'rms {o.label}':>24}" for o in m.observations)

@@ -9,6 +9,7 @@ A `views.toml` in the folder replaces that layout. Entries above the tables hold
     reference = "reference.cihx"        # a file, a folder, a pattern; [0:50] behind it selects frames
     flow = "run1.cihx[100:200]"
     [views.left]
+    frame_offset = 2                    # instant i is flow image i + 2 of this view
     row = 0
     column = 0
     height = 512
@@ -24,8 +25,9 @@ from __future__ import annotations
 import re
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import overload
 
 import numpy as np
@@ -44,7 +46,7 @@ from nerif.imaging.readers.open import open_frames, read_mask
 
 __all__ = [
     "BEFORE", "SOURCES", "VIEWS", "Images", "View", "find_views", "good_images", "read_sample", "views_file",
-    "write_crops",
+    "words_of_range", "write_crops",
 ]  # fmt: skip
 
 TOGETHER = (("target", "background"), ("reference", "flow"))
@@ -54,6 +56,8 @@ CROP = tuple(f.name for f in fields(Crop))
 HEADS = tuple(suffix for suffix in SUFFIXES if suffix != ".mraw")
 """Endings of files of images; the .mraw of a Photron recording stands beside its header."""
 VIEWS = "views.toml"
+OFFSET = "frame_offset"
+"""Name of a view's frame offset in views.toml, on the command line and in stores."""
 BEFORE = "views.before.toml"
 """Copy of a views.toml as it was before its first change, with its comments."""
 
@@ -68,6 +72,7 @@ class View:
     sources : arguments of open_frames, by the names of SOURCES
     crop : the view's part of each frame
     mosaic : Bayer pattern of its raw images, such as RGGB, or "none"; "" where it is in the metadata or is recognised
+    frame_offset : instant i of the measurement is flow image i + frame_offset of this view
     """
 
     name: str
@@ -75,11 +80,12 @@ class View:
     sources: dict[str, str]
     crop: Crop | None = None
     mosaic: str = ""
+    frame_offset: int = 0
     _opened: dict[str, Frames] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __reduce__(self) -> tuple[type[View], tuple[object, ...]]:
         """State for another process, which opens the files itself."""
-        return View, (self.name, self.folder, self.sources, self.crop, self.mosaic)
+        return View, (self.name, self.folder, self.sources, self.crop, self.mosaic, self.frame_offset)
 
     def open(self, source: str) -> Frames:
         """Return the frames of a source, opened once."""
@@ -115,6 +121,33 @@ class View:
         line = f"{self.sources[source]}: raw Bayer mosaic ({frames.binning.pattern}), binned to {height} x {width} px"
         override = "" if self.mosaic else '; mosaic = "none" in views.toml keeps all pixels'
         return *frames.notes, line + override
+
+    @property
+    def instants(self) -> range:
+        """Numbers of the instants of which the view has a flow image."""
+        return range(max(0, -self.frame_offset), len(self.open("flow")) - self.frame_offset)
+
+    def check_instants(self, numbers: Sequence[int], parameter: str) -> None:
+        """Raise an InputError that names a parameter, unless the view has a flow image of all these instants."""
+        if min(numbers) in self.instants and max(numbers) in self.instants:
+            return
+        got = words_of_range(range(min(numbers), max(numbers) + 1))
+        offset = f", frame offset {self.frame_offset}" if self.frame_offset else ""
+        raise InputError(
+            f"expected numbers within {words_of_range(self.instants)}, those of view '{self.name}' "
+            f"({len(self.open('flow'))} flow images{offset}), got {got}",
+            field=parameter,
+        )
+
+    def flow_image(self, instant: int) -> tuple[np.ndarray, str]:
+        """Return the flow image of an instant, cropped, and its name."""
+        frames, i = self.open("flow"), instant + self.frame_offset
+        return self.cropped(frames[i], frames.name(i)), frames.name(i)
+
+    def flow_time(self, instant: int) -> float | None:
+        """Return the recording time of a flow image, s; None if the file has none."""
+        times = self.open("flow").times
+        return None if times is None else float(times[instant + self.frame_offset])
 
     @property
     def full_scale(self) -> float:
@@ -157,13 +190,25 @@ class View:
         return self.crop(image, name) if self.crop else image
 
 
-def find_views(folder: Path, only: Sequence[str] = ()) -> tuple[View, ...]:
-    """Find the views of an experiment: those named in `only`, or all."""
+def words_of_range(numbers: range) -> str:
+    """Return a range in words, such as 0 to 9."""
+    return f"{numbers[0]} to {numbers[-1]}" if numbers else "none"
+
+
+def find_views(
+    folder: Path, only: Sequence[str] = (), frame_offsets: Mapping[str, int] = MappingProxyType({})
+) -> tuple[View, ...]:
+    """Find the views of an experiment: those named in `only`, or all.
+
+    Parameters
+    ----------
+    frame_offsets : by the names of views; others keep theirs
+    """
     with reading_as(folder, EXPERIMENT):
-        return _find(folder, only)
+        return _find(folder, only, frame_offsets)
 
 
-def _find(folder: Path, only: Sequence[str]) -> tuple[View, ...]:
+def _find(folder: Path, only: Sequence[str], frame_offsets: Mapping[str, int]) -> tuple[View, ...]:
     if not folder.is_dir():
         raise InputError("no such folder; expected one with a folder for each view", field=folder)
     file = views_file(folder)
@@ -178,6 +223,10 @@ def _find(folder: Path, only: Sequence[str]) -> tuple[View, ...]:
     for name in only:
         if name not in names:
             raise InputError(f"expected some of {', '.join(names)}, got '{name}'", field="views")
+    for name in frame_offsets:
+        if name not in names:
+            raise InputError(f"expected some of {', '.join(names)}, got '{name}'", field="frame_offset")
+    views = [replace(v, frame_offset=frame_offsets.get(v.name, v.frame_offset)) for v in views]
     return tuple(v for v in views if not only or v.name in only)
 
 
@@ -223,7 +272,7 @@ def _from_file(file: Path) -> list[View]:
     views = []
     for name, entries in tables.items():
         entries = {**table, **entries}
-        check_known(entries, (*SOURCES, *CROP, "mosaic"), str(file))
+        check_known(entries, (*SOURCES, *CROP, "mosaic", OFFSET), str(file))
         for key, value in entries.items():
             kind = str if key in (*SOURCES, "flip", "mosaic") else int
             if not isinstance(value, kind) or isinstance(value, bool):
@@ -239,7 +288,8 @@ def _from_file(file: Path) -> list[View]:
             for k, v in entries.items()
             if k in SOURCES
         }
-        views.append(View(name, file.parent, sources, Crop(**crop) if crop else None, mosaic))
+        crop_of_view = Crop(**crop) if crop else None
+        views.append(View(name, file.parent, sources, crop_of_view, mosaic, entries.get(OFFSET, 0)))
     return views
 
 
