@@ -23,6 +23,7 @@ from nerif.imaging.displacement.displacement import DisplacementMap, Displacemen
 from nerif.imaging.masks import MaskSettings, flow_mask
 from nerif.imaging.readers.exposure import check_exposure
 from nerif.imaging.readers.views import View, good_images
+from nerif.imaging.reference_outliers import without_outliers
 from nerif.imaging.workers import cores, work
 
 __all__ = ["Recording", "Scene", "Surroundings", "ViewReference", "camera_of", "join_views", "measure_instant"]
@@ -178,7 +179,7 @@ class ViewReference:
         say : called with a line about each unusable image
         """
         view.check_alike()
-        images = good_images(view, "reference", say, recording.references)
+        images = without_outliers(view, good_images(view, "reference", say, recording.references), say)
         shape = (images[0].shape[0], images[0].shape[1])
         camera = camera_of(view, recording.cameras[view.name], shape)
         reference = Reference.of(images, recording.method, view.full_scale, averages)
