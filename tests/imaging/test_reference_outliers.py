@@ -28,7 +28,7 @@ def dots(seed: int) -> np.ndarray:
 
 PATTERN = dots(0)
 FLOW = moved(PATTERN, (0, 1.5)) * (COLUMNS < 50) + PATTERN * (COLUMNS >= 50)
-HAND = np.where(ROWS < 60, 0.4, PATTERN)
+HAND = np.where(ROWS < 40, 0.4, PATTERN)
 BAD = {
     "shifted by (3.2, -0.4) px": moved(PATTERN, (-0.4, 3.2), mode="reflect"),
     "another scene": dots(1),
@@ -97,7 +97,7 @@ def test_references_of_a_vibrating_camera_are_used(vibration):
         for _ in range(6):
             scenes = [moved(PATTERN, shift, mode="reflect") for shift in rng.normal(0, vibration, (count, 2))]
             images = [Thumbnail.of(shot(scene, i)) for i, scene in enumerate(scenes)]
-            assert outliers(images, [0.0] * count, lambda: images[0]).reasons == {}
+            assert outliers(images, [0.0] * count, lambda: None).reasons == {}
 
 
 def test_noise_that_hides_the_pattern_makes_no_outliers():
