@@ -19,11 +19,12 @@ from nerif.common.settings import check_settings
 from nerif.data.measurement import Measurement
 from nerif.geometry import Box, Camera
 from nerif.imaging.calibration.cameras_file import CalibratedCamera
-from nerif.imaging.displacement.displacement import DisplacementMap, DisplacementSettings, Reference
+from nerif.imaging.displacement.displacement import OVEREXPOSED, DisplacementMap, DisplacementSettings, Reference
 from nerif.imaging.masks import MaskSettings, flow_mask
 from nerif.imaging.readers.exposure import check_exposure
 from nerif.imaging.readers.views import View, good_images
 from nerif.imaging.reference_outliers import without_outliers
+from nerif.imaging.unrelated import unrelated
 from nerif.imaging.workers import cores, work
 
 __all__ = ["Recording", "Scene", "Surroundings", "ViewReference", "camera_of", "join_views", "measure_instant"]
@@ -32,6 +33,7 @@ PixelMask = Bool[np.ndarray, "row column"]
 ViewMeasurement = tuple[Camera, DisplacementMap, PixelMask | None]
 """Camera, displacement and flow mask (or None) of a view."""
 
+FEW = 0.5  # share of valid pixels below which their number is reported
 WORTH_PROCESSES = 2**22  # pixels of all images together
 
 
@@ -157,6 +159,7 @@ class ViewReference:
     region : where the background is visible, or None
     drawn_mask : drawn flow mask, or None
     images : whether a displacement map includes the images
+    others : views whose images may have been exchanged with those of this one
     """
 
     view: View
@@ -166,6 +169,7 @@ class ViewReference:
     region: PixelMask | None = None
     drawn_mask: PixelMask | None = None
     images: bool = True
+    others: tuple[View, ...] = ()
 
     @classmethod
     def of(
@@ -184,7 +188,9 @@ class ViewReference:
         camera = camera_of(view, recording.cameras[view.name], shape)
         reference = Reference.of(images, recording.method, view.full_scale, averages)
         region, drawn_mask = view.mask("region", shape), view.mask("mask", shape)
-        return cls(view, camera, reference, recording.masks, region, drawn_mask, recording.images)
+        return cls(
+            view, camera, reference, recording.masks, region, drawn_mask, recording.images, recording.views
+        )  # fmt: skip
 
     def measure(self, numbers: Sequence[int], say: Callable[[str], None] = silent) -> ViewMeasurement:
         """Return camera, mean displacement over flow images of these numbers, and flow mask."""
@@ -194,13 +200,16 @@ class ViewReference:
             if exposure := check_exposure(images[-1], self.reference.full_scale, frames.name(i)):
                 say(f"note: {exposure}")
         result = self.reference.measure(images, self.region, self.images)
-        if not result.valid.any():
-            method = self.reference.settings
-            raise InputError(
-                f"no valid pixel (noise above {method.max_sigma:g} px or correlation below "
-                f"{method.min_correlation:g} everywhere); do the images show the same pattern, in focus?",
-                field=frames.name(numbers[0]),
-            )
+        share = 1 - sum(result.losses.values())
+        if share < FEW:
+            name = frames.name(numbers[0])
+            compared = result.losses[OVEREXPOSED] < FEW  # with fewer pixels the correlation decides nothing
+            if compared and (cause := unrelated(self.reference.mean, images[0], self.view, self.others)):
+                raise InputError(cause, field=name)
+            if not result.valid.any():
+                text = f"no valid pixel ({result.loss_text}); do the images show the same pattern, in focus?"
+                raise InputError(text, field=name)
+            say(f"note: view '{self.view.name}': {100 * share:.0f} % of its pixels are valid; {result.loss_text}")
         mask = self.drawn_mask
         if mask is None and self.masks is not None:
             d = np.where(result.valid[..., None], result.displacement, np.nan)

@@ -10,13 +10,19 @@ from jaxtyping import Complex, Float, Shaped
 
 from nerif.imaging.readers.frames import as_float
 
-__all__ = ["Thumbnail", "binned", "local_displacement", "match", "shifted"]
+__all__ = ["Thumbnail", "binned", "local_displacement", "match", "related", "shifted"]
 
 LONGEST = 256  # px of the longer side
 COARSE = 6.0  # px, standard deviation of the mean that is subtracted: vignettes and lamps are alike in all scenes
 FINE = 1.0  # px, standard deviation of the mean that follows binning: finer structures are undersampled
-CLIP = 4.0  # standard deviations, so that a reflection does not outweigh the pattern
+EVEN = 0.5  # of the median variance is added to the local one, so that parts without a pattern stay weak
+CLIP = 4.0  # standard deviations; an edge or a reflection does not outweigh the pattern
 TILE = 16  # px
+MIN_PIXELS = (
+    10_000  # of an image; smaller ones of one scene, half hidden and noisy, may not correlate by more than chance
+)
+HIGH = 0.3  # correlation that no two scenes have
+SIGNIFICANT = 8.0  # standard deviations over all shifts; the highest peak of two scenes has five
 
 
 @dataclass(frozen=True)
@@ -25,7 +31,7 @@ class Thumbnail:
 
     Parameters
     ----------
-    detail : grey values minus their local mean, in standard deviations; 0 in an image of a single grey
+    detail : grey values minus their local mean, in local standard deviations; 0 in an image of a single grey
     spectrum : Fourier transform of the detail under a window that fades towards the edges, of norm 1
     binning : pixels of the image per pixel of the thumbnail
     grey : mean of the grey values
@@ -45,8 +51,9 @@ class Thumbnail:
         small = binned(image, binning)
         fine = gaussian_filter(small, FINE, mode="nearest") if binning > 1 else small
         detail = fine - gaussian_filter(small, COARSE, mode="nearest")
-        deviation = float(detail.std())
-        detail = np.clip(detail / deviation, -CLIP, CLIP) if deviation > 0 else np.zeros_like(detail)
+        local = gaussian_filter(detail**2, COARSE, mode="nearest")
+        deviation = np.sqrt(local + EVEN * np.median(local) + 1e-12)
+        detail = np.clip(detail / deviation, -CLIP, CLIP)
         return cls._with_spectrum(detail, binning, float(image.mean()))
 
     @classmethod
@@ -76,10 +83,8 @@ def binned(image: Shaped[np.ndarray, "row column"], binning: int) -> Float[np.nd
 
 def match(first: Thumbnail, second: Thumbnail) -> tuple[float, Float[np.ndarray, " 2"]]:
     """Return the highest correlation of two images over all shifts, and the shift (x, y) of the second, px."""
-    from scipy import fft
-
-    shape = first.detail.shape
-    surface = fft.irfft2(np.conj(first.spectrum) * second.spectrum, s=shape)
+    surface = _correlation(first, second)
+    shape = surface.shape
     row, column = np.unravel_index(surface.argmax(), shape)
     peak = float(surface[row, column])
 
@@ -91,6 +96,24 @@ def match(first: Thumbnail, second: Thumbnail) -> tuple[float, Float[np.ndarray,
     x = column + fraction(surface[row, column - 1], surface[row, (column + 1) % shape[1]])
     wrapped = [(v + n / 2) % n - n / 2 for v, n in ((x, shape[1]), (y, shape[0]))]
     return peak, np.array(wrapped) * first.binning
+
+
+def related(first: Thumbnail, second: Thumbnail) -> bool:
+    """Return whether two images correlate at any shift by more than chance; small images count as related."""
+    if first.detail.shape != second.detail.shape:
+        return False
+    if first.detail.size < MIN_PIXELS:
+        return True
+    surface = _correlation(first, second)
+    peak, chance = float(surface.max()), float(surface.std())
+    return peak > HIGH or peak > SIGNIFICANT * chance > 0
+
+
+def _correlation(first: Thumbnail, second: Thumbnail) -> Float[np.ndarray, "row column"]:
+    """Correlation by the shift of the second image."""
+    from scipy import fft
+
+    return np.asarray(fft.irfft2(np.conj(first.spectrum) * second.spectrum, s=first.detail.shape))
 
 
 def shifted(thumbnail: Thumbnail, shift: Float[np.ndarray, " 2"]) -> Float[np.ndarray, "row column"]:
