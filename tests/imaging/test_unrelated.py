@@ -94,3 +94,23 @@ def test_losses_are_shares_of_the_visible_background(tmp_path):
     _, result, _ = ViewReference.of(recorded, view).measure([0])
     assert sum(result.losses.values()) == pytest.approx(1 - result.valid[:, 90:].mean())
     assert sum(result.losses.values()) < 0.6  # of all pixels more are lost
+
+
+def test_a_background_that_repeats_is_reported_and_lines_are_refused(tmp_path):
+    rows, columns = np.mgrid[: SHAPE[0], : SHAPE[1]].astype(float)
+
+    def grid(shift: float) -> list[np.ndarray]:
+        x, y = (0.5 + 0.5 * np.cos(2 * np.pi * v / 12) for v in (columns - shift, rows))
+        return [x * y] * 2
+
+    def lines(shift: float) -> list[np.ndarray]:
+        return [0.5 + 0.5 * np.cos(2 * np.pi * (columns - shift) / 12)] * 2
+
+    scenes = {f"{A}/reference": grid(0), f"{A}/flow": grid(5.5), f"{B}/reference": lines(0), f"{B}/flow": lines(1)}
+    notes: list[str] = []
+    measurement, _ = measure_instant(recording(tmp_path, scenes), say=notes.append)
+    assert B not in measurement.names
+    assert any(f"'{A}': its background repeats every 12.0 px along x and every 12.0 px along y" in n for n in notes)
+    assert any(f"'{A}': displacements reach 5." in line and "from 6.0 px on, half the period" in line for line in notes)
+    (left,) = (line for line in notes if f"view '{B}' left out" in line)
+    assert "has lines along y, and no shift along them can be measured" in left

@@ -20,6 +20,7 @@ from nerif.data.measurement import Measurement
 from nerif.geometry import Box, Camera
 from nerif.imaging.calibration.cameras_file import CalibratedCamera
 from nerif.imaging.displacement.displacement import OVEREXPOSED, DisplacementMap, DisplacementSettings, Reference
+from nerif.imaging.displacement.repetition import Repetition, repetition
 from nerif.imaging.masks import MaskSettings, flow_mask
 from nerif.imaging.readers.exposure import check_exposure
 from nerif.imaging.readers.views import View, good_images
@@ -33,6 +34,7 @@ PixelMask = Bool[np.ndarray, "row column"]
 ViewMeasurement = tuple[Camera, DisplacementMap, PixelMask | None]
 """Camera, displacement and flow mask (or None) of a view."""
 
+AMBIGUOUS = 0.4, 0.005  # part of a period, and share of the pixels displaced by more
 FEW = 0.5  # share of valid pixels below which their number is reported
 WORTH_PROCESSES = 2**22  # pixels of all images together
 
@@ -160,6 +162,7 @@ class ViewReference:
     drawn_mask : drawn flow mask, or None
     images : whether a displacement map includes the images
     others : views whose images may have been exchanged with those of this one
+    repeats : how the background repeats, or None
     """
 
     view: View
@@ -170,6 +173,7 @@ class ViewReference:
     drawn_mask: PixelMask | None = None
     images: bool = True
     others: tuple[View, ...] = ()
+    repeats: Repetition | None = None
 
     @classmethod
     def of(
@@ -180,7 +184,7 @@ class ViewReference:
         Parameters
         ----------
         averages : number of flow images whose displacements will be averaged
-        say : called with a line about each unusable image
+        say : called with a line about each unusable image, and about a background that repeats
         """
         view.check_alike()
         images = without_outliers(view, good_images(view, "reference", say, recording.references), say)
@@ -188,8 +192,13 @@ class ViewReference:
         camera = camera_of(view, recording.cameras[view.name], shape)
         reference = Reference.of(images, recording.method, view.full_scale, averages)
         region, drawn_mask = view.mask("region", shape), view.mask("mask", shape)
+        if (repeats := repetition(reference.mean)) is not None:
+            text = f"its background {repeats}; print random dots (nerif pattern --kind dots)"
+            if repeats.lines is not None:  # the error along them is unknown: noise looks like structure
+                raise InputError(text, field=f"view '{view.name}'")
+            say(f"note: view '{view.name}': {text}")
         return cls(
-            view, camera, reference, recording.masks, region, drawn_mask, recording.images, recording.views
+            view, camera, reference, recording.masks, region, drawn_mask, recording.images, recording.views, repeats
         )  # fmt: skip
 
     def measure(self, numbers: Sequence[int], say: Callable[[str], None] = silent) -> ViewMeasurement:
@@ -203,13 +212,24 @@ class ViewReference:
         share = 1 - sum(result.losses.values())
         if share < FEW:
             name = frames.name(numbers[0])
-            compared = result.losses[OVEREXPOSED] < FEW  # with fewer pixels the correlation decides nothing
-            if compared and (cause := unrelated(self.reference.mean, images[0], self.view, self.others)):
+            # the correlation of few pixels, or of a background that repeats, decides nothing
+            decisive = result.losses[OVEREXPOSED] < FEW and self.repeats is None
+            if decisive and (cause := unrelated(self.reference.mean, images[0], self.view, self.others)):
                 raise InputError(cause, field=name)
             if not result.valid.any():
-                text = f"no valid pixel ({result.loss_text}); do the images show the same pattern, in focus?"
+                text = f"no valid pixel ({result.loss_text}); do the images show one pattern, in focus?"
                 raise InputError(text, field=name)
             say(f"note: view '{self.view.name}': {100 * share:.0f} % of its pixels are valid; {result.loss_text}")
+        if self.repeats is not None:
+            d = result.displacement[result.valid]
+            part, pixels = AMBIGUOUS
+            if np.mean(self.repeats.reach(d) > part) > pixels:
+                far = np.quantile(np.linalg.norm(d, axis=-1), 1 - pixels)
+                half = min(np.linalg.norm(p) for p in self.repeats.periods) / 2
+                say(
+                    f"note: view '{self.view.name}': displacements reach {far:.1f} px; from {half:.1f} px on, half the "
+                    "period of its background, they are wrong by whole periods"
+                )
         mask = self.drawn_mask
         if mask is None and self.masks is not None:
             d = np.where(result.valid[..., None], result.displacement, np.nan)

@@ -38,7 +38,10 @@ def unrelated(reference: Grey, flow: Grey, view: View, views: Sequence[View]) ->
             return f"{text}, but with those of view '{other.name}'; exchanged?"
         if any(related(still, f) for f in _thumbnails(other, "flow", 1, flow.shape)):
             return f"{text}; these match the flow images of view '{other.name}'; references exchanged?"
-    return f"{text}, nor do other flow images; are the references of another run or camera, or out of focus?"
+    return (
+        f"{text}, nor do other flow images; are the references of another run or camera, images out of focus, or "
+        "displacements too large?"
+    )
 
 
 def _thumbnails(view: View, source: str, most: int, shape: tuple[int, ...]) -> Iterator[Thumbnail]:

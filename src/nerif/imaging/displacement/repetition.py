@@ -122,7 +122,10 @@ def _autocorrelation(window: np.ndarray) -> tuple[np.ndarray, tuple[int, int]]:
     from scipy import fft
     from scipy.ndimage import gaussian_filter
 
-    detail = window - gaussian_filter(window, min(window.shape) / COARSE, mode="nearest")
+    y, x = (np.ravel(v) for v in np.mgrid[[slice(-1, 1, n * 1j) for n in window.shape]])
+    light = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)  # which a filter distorts at the edges
+    detail = window - (light @ np.linalg.lstsq(light, window.ravel(), rcond=None)[0]).reshape(window.shape)
+    detail -= gaussian_filter(detail, min(window.shape) / COARSE, mode="nearest")
     detail -= detail.mean()
     shape = tuple(2 * n for n in window.shape)
 
