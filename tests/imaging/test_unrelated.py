@@ -66,6 +66,16 @@ def test_a_view_of_unrelated_images_is_left_out_with_the_cause(tmp_path, case):
     assert cause in line
 
 
+def test_the_bad_one_of_several_averaged_images_is_left_out(tmp_path):
+    recorded = recording(tmp_path, {f"{A}/flow": [dots(0), dots(7)]})
+    lines: list[str] = []
+    reference = ViewReference.of(recorded, recorded.views[0])
+    both, one = (reference.measure(numbers, lines.append)[1] for numbers in ([0, 1], [0]))
+    (line,) = (line for line in lines if line.startswith("left out"))
+    assert line.startswith(f"left out: {A}/flow.tif frame 1: does not correlate")
+    assert np.array_equal(both.displacement, one.displacement)
+
+
 def test_few_valid_pixels_are_reported_with_their_causes(tmp_path):
     hidden, lit = np.copy(dots(0)), np.copy(dots(1))
     hidden[:, :90] = 0.4

@@ -203,38 +203,60 @@ class ViewReference:
 
     def measure(self, numbers: Sequence[int], say: Callable[[str], None] = silent) -> ViewMeasurement:
         """Return camera, mean displacement over flow images of these numbers, and flow mask."""
-        frames, images = self.view.open("flow"), []
+        frames, images = self.view.open("flow"), {}
         for i in numbers:
-            images.append(self.view.cropped(frames[i], frames.name(i)))
-            if exposure := check_exposure(images[-1], self.reference.full_scale, frames.name(i)):
+            name = frames.name(i)
+            image = self.view.cropped(frames[i], name)
+            if exposure := check_exposure(image, self.reference.full_scale, name):
                 say(f"note: {exposure}")
-        result = self.reference.measure(images, self.region, self.images)
-        share = 1 - sum(result.losses.values())
-        if share < FEW:
-            name = frames.name(numbers[0])
-            # the correlation of few pixels, or of a background that repeats, decides nothing
-            decisive = result.losses[OVEREXPOSED] < FEW and self.repeats is None
-            if decisive and (cause := unrelated(self.reference.mean, images[0], self.view, self.others)):
-                raise InputError(cause, field=name)
-            if not result.valid.any():
-                text = f"no valid pixel ({result.loss_text}); do the images show one pattern, in focus?"
-                raise InputError(text, field=name)
-            say(f"note: view '{self.view.name}': {100 * share:.0f} % of its pixels are valid; {result.loss_text}")
-        if self.repeats is not None:
-            d = result.displacement[result.valid]
-            part, pixels = AMBIGUOUS
-            if np.mean(self.repeats.reach(d) > part) > pixels:
-                far = np.quantile(np.linalg.norm(d, axis=-1), 1 - pixels)
-                half = min(np.linalg.norm(p) for p in self.repeats.periods) / 2
-                say(
-                    f"note: view '{self.view.name}': displacements reach {far:.1f} px; from {half:.1f} px on, half the "
-                    "period of its background, they are wrong by whole periods"
-                )
+            if len(numbers) > 1 and (cause := self._unrelated(image)):  # the mean would hide it
+                say(f"left out: {name}: {cause}")
+                continue
+            images[name] = image
+        if not images:
+            raise InputError(f"none of the {len(numbers)} flow images can be used; {cause}", field=name)
+        result = self.reference.measure(list(images.values()), self.region, self.images)
+        self._check_share(result, images, say)
+        self._check_period(result, say)
         mask = self.drawn_mask
         if mask is None and self.masks is not None:
             d = np.where(result.valid[..., None], result.displacement, np.nan)
             mask = flow_mask(d, result.sigma, self.masks)
         return self.camera, result, mask
+
+    def _unrelated(self, image: np.ndarray) -> str:
+        """Cause of a flow image that shows another scene, or ""; a background that repeats correlates with any."""
+        return "" if self.repeats else unrelated(self.reference.mean, image, self.view, self.others)
+
+    def _check_share(
+        self, result: DisplacementMap, images: Mapping[str, np.ndarray], say: Callable[[str], None]
+    ) -> None:
+        """Refuse flow images of another scene, and those without valid pixels; report few valid pixels."""
+        share = 1 - sum(result.losses.values())
+        if share >= FEW:
+            return
+        if result.losses[OVEREXPOSED] < FEW:  # the correlation of few pixels decides nothing
+            for name, image in images.items():
+                if cause := self._unrelated(image):
+                    raise InputError(cause, field=name)
+        if not result.valid.any():
+            text = f"no valid pixel ({result.loss_text}); do the images show one pattern, in focus?"
+            raise InputError(text, field=next(iter(images)))
+        say(f"note: view '{self.view.name}': {100 * share:.0f} % of its pixels are valid; {result.loss_text}")
+
+    def _check_period(self, result: DisplacementMap, say: Callable[[str], None]) -> None:
+        """Report displacements that a repeating background makes ambiguous."""
+        if self.repeats is None:
+            return
+        part, pixels = AMBIGUOUS
+        d = result.displacement[result.valid]
+        if np.mean(self.repeats.reach(d) > part) > pixels:
+            far = np.quantile(np.linalg.norm(d, axis=-1), 1 - pixels)
+            half = min(np.linalg.norm(p) for p in self.repeats.periods) / 2
+            say(
+                f"note: view '{self.view.name}': displacements reach {far:.1f} px; from {half:.1f} px on, half the "
+                "period of its background, they are wrong by whole periods"
+            )
 
 
 def camera_of(view: View, calibrated: CalibratedCamera, shape: tuple[int, int]) -> Camera:
