@@ -204,6 +204,7 @@ def test_a_crop_needs_the_image_size_of_the_calibration(tmp_path, crop, shape):
 
 @pytest.mark.slow
 def test_several_processes_give_the_results_of_one(recording, tmp_path):
+    recording = replace(recording, images=False)  # whose pixels that are not valid are NaN
     single, _ = measure_instant(recording, processes=1)
     several, _ = measure_instant(recording, processes=2)
     assert torch.equal(several.displacement.nan_to_num(), single.displacement.nan_to_num())

@@ -12,6 +12,8 @@ from nerif.common.conventions import InputError
 from nerif.imaging.readers.exposure import check_exposure, full_scale, saturated
 from nerif.imaging.readers.frames import as_float
 from nerif.imaging.readers.views import View, read_sample
+from nerif.imaging.reference_outliers import flow_thumbnail, outliers
+from nerif.imaging.thumbnails import Thumbnail
 
 __all__ = ["ImageQuality", "image_quality", "jpeg_address", "shrink"]
 
@@ -56,6 +58,7 @@ def image_quality(view: View, source: str, most: int = 12) -> ImageQuality:
     bad: list[tuple[str, str]] = []
     notes = list(view.notes(source))
     good: tuple[int, np.ndarray] | None = None
+    checks: list[tuple[str, Thumbnail, float]] = []
     for i, name, image in read_sample(view, source, most):
         sampled += 1
         if isinstance(image, InputError):
@@ -64,6 +67,13 @@ def image_quality(view: View, source: str, most: int = 12) -> ImageQuality:
         if note := check_exposure(image, full_scale(frames), name):
             notes.append(note)
         good = good or (i, image)
+        if source == "reference":
+            checks.append((name, Thumbnail.of(image), float(np.mean(saturated(image, full_scale(frames))))))
+    if checks:
+        names, thumbnails, shares = zip(*checks, strict=True)
+        result = outliers(thumbnails, shares, lambda: flow_thumbnail(view))
+        bad += [(names[k], reason) for k, reason in sorted(result.reasons.items())]
+        notes += [result.note] if result.note else []
     if good is None:
         name, why = bad[0]
         raise InputError(

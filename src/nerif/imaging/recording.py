@@ -19,16 +19,21 @@ from nerif.common.settings import check_settings
 from nerif.data.measurement import Measurement
 from nerif.geometry import Box, Camera
 from nerif.imaging.calibration.cameras_file import CalibratedCamera
-from nerif.imaging.displacement.displacement import DisplacementMap, DisplacementSettings, Reference
+from nerif.imaging.displacement.displacement import OVEREXPOSED, DisplacementMap, DisplacementSettings, Reference
+from nerif.imaging.displacement.repetition import Repetition, repetition
 from nerif.imaging.masks import MaskSettings, flow_mask
 from nerif.imaging.readers.exposure import check_exposure
 from nerif.imaging.readers.views import View, good_images
+from nerif.imaging.reference_outliers import without_outliers
+from nerif.imaging.unrelated import unrelated
 from nerif.imaging.workers import cores, work
 
 __all__ = ["Recording", "Scene", "Surroundings", "ViewReference", "camera_of", "join_views", "measure_instant"]
 
 PixelMask = Bool[np.ndarray, "row column"]
 
+AMBIGUOUS = 0.4, 0.005  # part of a period, and share of the pixels displaced by more
+FEW = 0.5  # share of valid pixels below which their number is reported
 WORTH_PROCESSES = 2**22  # pixels of all images together
 
 
@@ -166,6 +171,8 @@ class ViewReference:
     region : where the background is visible, or None
     drawn_mask : drawn flow mask, or None
     images : whether a displacement map includes the images
+    others : views whose images may have been exchanged with those of this one
+    repeats : how the background repeats, or None
     """
 
     view: View
@@ -175,6 +182,8 @@ class ViewReference:
     region: PixelMask | None = None
     drawn_mask: PixelMask | None = None
     images: bool = True
+    others: tuple[View, ...] = ()
+    repeats: Repetition | None = None
 
     @classmethod
     def of(
@@ -185,10 +194,10 @@ class ViewReference:
         Parameters
         ----------
         averages : number of flow images whose displacements will be averaged
-        say : called with a line about each unusable image
+        say : called with a line about each unusable image, and about a background that repeats
         """
         view.check_alike()
-        images = good_images(view, "reference", say, recording.references)
+        images = without_outliers(view, good_images(view, "reference", say, recording.references), say)
         for note in view.open("flow").notes:
             if note not in view.open("reference").notes:
                 say(f"note: {note}")
@@ -196,27 +205,70 @@ class ViewReference:
         camera = camera_of(view, recording.cameras[view.name], shape)
         reference = Reference.of(images, recording.method, view.full_scale, averages)
         region, drawn_mask = (view.mask(source, shape, say) for source in ("region", "mask"))
-        return cls(view, camera, reference, recording.masks, region, drawn_mask, recording.images)
+        if (repeats := repetition(reference.mean)) is not None:
+            text = f"its background {repeats}; print random dots (nerif pattern --kind dots)"
+            if repeats.lines is not None:  # the error along them is unknown: noise looks like structure
+                raise InputError(text, field=f"view '{view.name}'")
+            say(f"note: view '{view.name}': {text}")
+        return cls(
+            view, camera, reference, recording.masks, region, drawn_mask, recording.images, recording.views, repeats
+        )  # fmt: skip
 
     def measure(self, numbers: Sequence[int], say: Callable[[str], None] = silent) -> ViewMeasurement:
         """Return camera, mean displacement over the flow images of these instants, and flow mask."""
-        images, names = zip(*(self.view.flow_image(i) for i in numbers), strict=True)
-        for image, name in zip(images, names, strict=True):
+        images = {}
+        for i in numbers:
+            image, name = self.view.flow_image(i)
             if exposure := check_exposure(image, self.reference.full_scale, name):
                 say(f"note: {exposure}")
-        result = self.reference.measure(images, self.region, self.images)
-        if not result.valid.any():
-            method = self.reference.settings
-            raise InputError(
-                f"no valid pixel (noise above {method.max_sigma:g} px or correlation below "
-                f"{method.min_correlation:g} everywhere); do the images show the same pattern, in focus?",
-                field=names[0],
-            )
+            if len(numbers) > 1 and (cause := self._unrelated(image)):  # the mean would hide it
+                say(f"left out: {name}: {cause}")
+                continue
+            images[name] = image
+        if not images:
+            raise InputError(f"none of the {len(numbers)} flow images can be used; {cause}", field=name)
+        result = self.reference.measure(list(images.values()), self.region, self.images)
+        self._check_share(result, images, say)
+        self._check_period(result, say)
         mask = self.drawn_mask
         if mask is None and self.masks is not None:
             d = np.where(result.valid[..., None], result.displacement, np.nan)
             mask = flow_mask(d, result.sigma, self.masks)
         return ViewMeasurement(self.camera, result, mask, self.view.frame_offset)
+
+    def _unrelated(self, image: np.ndarray) -> str:
+        """Cause of a flow image that shows another scene, or ""; a background that repeats correlates with any."""
+        return "" if self.repeats else unrelated(self.reference.mean, image, self.view, self.others)
+
+    def _check_share(
+        self, result: DisplacementMap, images: Mapping[str, np.ndarray], say: Callable[[str], None]
+    ) -> None:
+        """Refuse flow images of another scene, and those without valid pixels; report few valid pixels."""
+        share = 1 - sum(result.losses.values())
+        if share >= FEW:
+            return
+        if result.losses[OVEREXPOSED] < FEW:  # the correlation of few pixels decides nothing
+            for name, image in images.items():
+                if cause := self._unrelated(image):
+                    raise InputError(cause, field=name)
+        if not result.valid.any():
+            text = f"no valid pixel ({result.loss_text}); do the images show one pattern, in focus?"
+            raise InputError(text, field=next(iter(images)))
+        say(f"note: view '{self.view.name}': {100 * share:.0f} % of its pixels are valid; {result.loss_text}")
+
+    def _check_period(self, result: DisplacementMap, say: Callable[[str], None]) -> None:
+        """Report displacements that a repeating background makes ambiguous."""
+        if self.repeats is None:
+            return
+        part, pixels = AMBIGUOUS
+        d = result.displacement[result.valid]
+        if np.mean(self.repeats.reach(d) > part) > pixels:
+            far = np.quantile(np.linalg.norm(d, axis=-1), 1 - pixels)
+            half = min(np.linalg.norm(p) for p in self.repeats.periods) / 2
+            say(
+                f"note: view '{self.view.name}': displacements reach {far:.1f} px; from {half:.1f} px on, half the "
+                "period of its background, they are wrong by whole periods"
+            )
 
 
 def camera_of(view: View, calibrated: CalibratedCamera, shape: tuple[int, int]) -> Camera:

@@ -54,12 +54,14 @@ def _reference(recording: Recording, view: View) -> tuple[ViewReference | InputE
         return error, lines
 
 
-def measure_frame(references: Sequence[ViewReference], scene: Scene, number: int) -> tuple[Measurement, list[str]]:
-    """Return the measurement of one instant, and the errors of the views that are left out."""
+def measure_frame(
+    references: Sequence[ViewReference], scene: Scene, number: int, say: Callable[[str], None] = silent
+) -> tuple[Measurement, list[str]]:
+    """Return the measurement of one instant, and the errors of the views that are left out; report few pixels."""
     results, errors = [], []
     for reference in references:
         try:
-            results.append(reference.measure([number]))
+            results.append(reference.measure([number], say))
         except InputError as error:
             errors.append(f"view '{reference.view.name}': {error}")
     if not results:
@@ -134,7 +136,7 @@ def measure_recording(
         count = sum(map(sequence.is_written, range(len(numbers))))
         say(f"{out}: {count} of {len(numbers)} frames exist already")
     else:
-        sequence = _create(references, recording.scene, numbers, times, out, settings, force)
+        sequence = _create(references, recording.scene, numbers, times, out, settings, force, say)
     todo = [i for i in range(len(numbers)) if not sequence.is_written(i)]
     count, incomplete = len(numbers) - len(todo), 0
     if processes is None:
@@ -200,18 +202,21 @@ def _camera_numbers(camera: Camera) -> dict[str, Tensor]:
 
 def _create(
     references: Sequence[ViewReference], scene: Scene, numbers: range, times: Sequence[float], out: Path,
-    settings: dict[str, Any], force: bool,
+    settings: dict[str, Any], force: bool, say: Callable[[str], None],
 ) -> MeasurementSequence:  # fmt: skip
-    """A new store with the first frame that has all views."""
+    """A new store with the first frame that has all views, whose notes stand for those of all frames."""
     import zarr
 
     reasons = []
     for index, number in enumerate(numbers):
+        lines: list[str] = []
         try:
-            measurement, errors = measure_frame(references, scene, number)
+            measurement, errors = measure_frame(references, scene, number, lines.append)
         except InputError as error:
             errors = [str(error)]
         if not errors:
+            for line in lines:
+                say(f"frame {number}: {line}")
             sequence = MeasurementSequence.create(out, times, measurement, force)
             zarr.open_group(out, mode="r+").attrs["displacement"] = settings
             sequence.write_frame(index, measurement)

@@ -11,8 +11,8 @@ smoothing error of a window of that reach, applied to d, is added to both.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 import numpy as np
@@ -28,7 +28,16 @@ from nerif.imaging.displacement.warping import warp
 from nerif.imaging.readers.exposure import saturated
 from nerif.imaging.readers.frames import as_float
 
-__all__ = ["DisplacementMap", "DisplacementSettings", "Reference", "border", "displacement", "measure", "remove_shake"]
+__all__ = [
+    "OVEREXPOSED",
+    "DisplacementMap",
+    "DisplacementSettings",
+    "Reference",
+    "border",
+    "displacement",
+    "measure",
+    "remove_shake",
+]
 
 Grey = Shaped[np.ndarray, "row column"]
 Image = Float[np.ndarray, "row column"]
@@ -37,6 +46,7 @@ PixelMask = Bool[np.ndarray, "row column"]
 REACH = {"deepflow": 1.5, "dis": 1.5, "tvl1": 1.3, "ilk": 1.6, "correlation": 1.8}
 """Standard deviation (px) of the averaging window of each method at smoothness 1 (benchmarks/displacement.py)."""
 
+OVEREXPOSED = "over-exposed"  # cause of loss
 MAX_REPEATS = 12  # reference frames that are compared with the mean of the others,
 MEGAPIXEL = 2**20  # in images up to this number of pixels
 
@@ -78,6 +88,7 @@ class DisplacementMap:
     sigma : standard deviation of its noise, px
     noise_source : "repeats" (of the reference, and residual) or "structure tensor"
     pair : the images; None for the mean of several
+    losses : shares of the region's pixels that are not valid, by cause, the largest first
     """
 
     displacement: Vectors
@@ -85,6 +96,12 @@ class DisplacementMap:
     valid: PixelMask
     noise_source: str
     pair: ImagePair | None = None
+    losses: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def loss_text(self) -> str:
+        """The losses in words, such as "52 % uncorrelated, 9 % over-exposed"."""
+        return ", ".join(f"{100 * share:.0f} % {cause}" for cause, share in self.losses.items() if share >= 0.005)
 
 
 def displacement(reference: Grey, flow: Grey, settings: DisplacementSettings) -> Vectors:
@@ -171,15 +188,25 @@ class Reference:
         sigma = np.sqrt(sigma**2 + smoothing_error(d, reach) ** 2).astype(np.float32)
         height, width = d.shape[:2]
         row, column = np.arange(height)[:, None] - d[..., 1], np.arange(width) - d[..., 0]
-        usable = ~_dilated(overexposed, 2) if region is None else region & ~_dilated(overexposed, 2)
-        valid = (row >= 0) & (row <= height - 1) & (column >= 0) & (column <= width - 1) & usable
-        valid &= (agreement >= settings.min_correlation) & (sigma.max(-1) <= settings.max_sigma)
+        exposed = ~_dilated(overexposed, 2)
+        conditions = {
+            OVEREXPOSED: exposed,
+            "outside the reference": (row >= 0) & (row <= height - 1) & (column >= 0) & (column <= width - 1),
+            "uncorrelated": agreement >= settings.min_correlation,
+            f"with noise above {settings.max_sigma:g} px": sigma.max(-1) <= settings.max_sigma,
+        }
+        inside = np.ones((height, width), dtype=bool) if region is None else region
+        usable, valid, losses = inside & exposed, inside, {}
+        for cause, condition in conditions.items():  # a pixel counts for the first cause
+            losses[cause] = float((valid & ~condition).sum() / max(int(inside.sum()), 1))
+            valid = valid & condition
+        losses = dict(sorted(losses.items(), key=lambda item: -item[1]))
         pair = None
         if keep_images and len(flow) == 1 and bool(valid.any()):
             reference = warp(self.mean, -shake) if settings.shake_border else self.mean
             grey = np.asarray(flow[0], dtype=np.float32)
             pair = ImagePair.of(reference, grey, d, self.camera_noise, self.count, usable, valid)
-        return DisplacementMap(d, sigma, valid, source, pair)
+        return DisplacementMap(d, sigma, valid, source, pair, losses)
 
 
 def measure(

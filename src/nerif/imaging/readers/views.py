@@ -336,6 +336,14 @@ class Images(Sequence[np.ndarray]):
         index = self._indices[i]
         return self._view.cropped(self._frames[index], self._frames.name(index))
 
+    def name(self, i: int) -> str:
+        """Return the name of an image in messages."""
+        return self._frames.name(self._indices[i])
+
+    def select(self, numbers: Sequence[int]) -> Images:
+        """Return the images of these numbers."""
+        return Images(self._view, self._frames, [self._indices[i] for i in numbers])
+
 
 def read_sample(view: View, source: str, most: int = 0) -> Iterator[tuple[int, str, np.ndarray | InputError]]:
     """Yield number, name and cropped image (or its error) of `most` evenly spread images of a source; 0 for all."""
