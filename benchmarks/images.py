@@ -27,7 +27,7 @@ from nerif.geometry import Grid, Lens, paper_rig
 from nerif.imaging.displacement.displacement import DisplacementSettings
 from nerif.imaging.displacement.displacement import measure as measure_displacement
 from nerif.imaging.patterns import Background
-from nerif.imaging.recording import Scene, Surroundings, join_views
+from nerif.imaging.recording import Scene, Surroundings, ViewMeasurement, join_views
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.shared_settings import Source
 from nerif.reconstruction.voxels.total_variation import TotalVariation
@@ -127,7 +127,7 @@ def photographed(
     for method in ("correlation", "dis"):
         settings = DisplacementSettings(method)
         results = [measure_displacement(references, [image], settings) for references, image in images]
-        views = ((camera, one, None) for camera, one in zip(cameras, results, strict=True))
+        views = (ViewMeasurement(camera, one, None) for camera, one in zip(cameras, results, strict=True))
         join_views(views, scene, images=True).write(folder / f"{method}.nc")
     replace(Measurement.read(folder / "correlation.nc"), displacement=None, sigma=None).write(folder / "none.nc")
     return folder
