@@ -281,9 +281,15 @@ def camera_of(view: View, calibrated: CalibratedCamera, shape: tuple[int, int]) 
         return calibrated.camera(image_size=shape)
     if crop is not None and calibrated.image_size == frame and not turned:
         return calibrated.camera().view(crop.row, crop.column, *shape)
+    transposed = shape[0] != shape[1] and calibrated.image_size == shape[::-1] and crop is None
+    remedy = (
+        'if rows and columns are exchanged (arrays of MATLAB), give rotate = 90, flip = "vertical" in views.toml'
+        if transposed
+        else "calibrate with the same crop, or with the whole frame and no flip"
+    )
     raise InputError(
         f"its images have {shape[0]} x {shape[1]} px (height x width), its camera was calibrated "
-        f"with {calibrated.image_size}; calibrate with the same crop, or with the whole frame and no flip",
+        f"with {calibrated.image_size}; {remedy}",
         field=name,
     )
 

@@ -85,8 +85,11 @@ def outliers(
 def without_outliers(view: View, images: Images, say: Callable[[str], None]) -> Images:
     """Return the reference images of a view that agree with one another; report the others."""
     full = view.full_scale
-    checks = [(Thumbnail.of(image), float(np.mean(saturated(image, full)))) for image in images]
-    result = outliers(*zip(*checks, strict=True), lambda: flow_thumbnail(view))
+    thumbnails, shares = [], []
+    for image in images:  # read once
+        thumbnails.append(Thumbnail.of(image))
+        shares.append(float(np.mean(saturated(image, full))))
+    result = outliers(thumbnails, shares, lambda: flow_thumbnail(view))
     for i, reason in sorted(result.reasons.items()):
         say(f"left out: {images.name(i)}: {reason}")
     if result.note:
