@@ -32,8 +32,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
                 continue
             where = found / "run" / name / source
             where.mkdir(parents=True)
+            scene = rng.integers(20, 220, (HEIGHT, WIDTH), dtype=np.uint8)
             for i in range(2):
-                iio.imwrite(where / f"p{i}.png", rng.integers(20, 220, (HEIGHT, WIDTH), dtype=np.uint8))
+                iio.imwrite(where / f"p{i}.png", scene)
     (found / "run" / "cam <2>" / "reference" / "p1.png").write_bytes(b"broken")
     return found
 

@@ -467,6 +467,25 @@ def test_hdf5_with_one_dataset_and_wrong_times(tmp_path, stack12):
         open_frames("a.hdf5", tmp_path)
 
 
+def test_hdf5_of_matlab_has_rows_and_columns_exchanged(tmp_path, stack12):
+    """MATLAB's images(:, :, k), stored by columns: version 7.3 of its .mat marks it, h5write does not."""
+    by_columns = stack12.transpose(0, 2, 1)
+    with h5py.File(tmp_path / "v73.h5", "w", userblock_size=512) as file:
+        file["images"] = by_columns
+        file["images"].attrs["MATLAB_class"] = np.bytes_("uint16")
+        file["times"] = np.arange(N, dtype=float)[:, None]
+        file["times"].attrs["MATLAB_class"] = np.bytes_("double")
+    with (tmp_path / "v73.h5").open("r+b") as raw:
+        raw.write(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(116))
+    frames = open_frames("v73.h5:images", tmp_path)
+    same(frames, stack12)
+    assert frames.times.tolist() == list(range(N))
+    with h5py.File(tmp_path / "h5write.h5", "w") as file:
+        file["images"] = by_columns
+    transpose = Crop(rotate=90, flip="vertical")
+    np.testing.assert_array_equal([transpose(image) for image in open_frames("h5write.h5", tmp_path)], stack12)
+
+
 # --- selections, laziness
 
 

@@ -202,6 +202,15 @@ def test_a_crop_needs_the_image_size_of_the_calibration(tmp_path, crop, shape):
     assert camera_of(replace(view, crop=Crop()), unsized, SHAPE).image_size == SHAPE
 
 
+def test_exchanged_rows_and_columns_are_recognised_by_the_calibration(tmp_path):
+    (whole,) = Ring(views=1, arc=(0.0, 120.0), image_size=SHAPE, pixel_pitch=0.06).cameras()
+    tifffile.imwrite(tmp_path / "flow.tif", np.zeros(SHAPE[::-1], np.uint16))
+    view, calibrated = View("left", tmp_path, {"flow": "flow.tif"}), CalibratedCamera.from_camera(whole)
+    with pytest.raises(InputError, match='rotate = 90, flip = "vertical"'):
+        camera_of(view, calibrated, SHAPE[::-1])
+    assert camera_of(replace(view, crop=Crop(rotate=90, flip="vertical")), calibrated, SHAPE).image_size == SHAPE
+
+
 @pytest.mark.slow
 def test_several_processes_give_the_results_of_one(recording, tmp_path):
     recording = replace(recording, images=False)  # whose pixels that are not valid are NaN

@@ -82,6 +82,14 @@ def test_the_flow_image_decides_between_two_references(tmp_path):
     assert "shifted by 5.0 px from the other reference and the flow images" in lines[1]
 
 
+def test_the_quality_of_references_needs_no_flow_images(tmp_path):
+    view = write(tmp_path, [dots(1), dots(2)])
+    quality = image_quality(replace(view, sources={"reference": "cam1/reference"}), "reference")
+    assert quality.bad == ()
+    (note,) = quality.notes
+    assert note.startswith("view 'cam1': the 2 references do not correlate")
+
+
 def test_references_that_nothing_decides_between_are_named_and_used(tmp_path):
     lines: list[str] = []
     assert len(check(write(tmp_path, [dots(1), dots(2)], PATTERN), lines)) == 2

@@ -353,7 +353,7 @@ def _synchronous(film: MeasurementSequence, instant: int, shifts: Mapping[str, i
             return torch.cat([ours[:i], theirs[j : j + 1], ours[i + 1 :]])
 
         fields = ("displacement", "sigma", "valid", "flow_mask")
-        changes = {field: exchanged(getattr(result, field), getattr(later, field)) for field in fields}
-        maps = {key: exchanged(value, later.maps[key]) for key, value in result.maps.items()}
+        changes: dict[str, Any] = {field: exchanged(getattr(result, field), getattr(later, field)) for field in fields}
+        maps: Any = {key: exchanged(value, later.maps[key]) for key, value in result.maps.items()}
         result = replace(result, maps=maps, **changes)
     return result

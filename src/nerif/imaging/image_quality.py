@@ -69,11 +69,12 @@ def image_quality(view: View, source: str, most: int = 12) -> ImageQuality:
         good = good or (i, image)
         if source == "reference":
             checks.append((name, Thumbnail.of(image), float(np.mean(saturated(image, full_scale(frames))))))
-    if checks:
+    if good is not None and checks:
         names, thumbnails, shares = zip(*checks, strict=True)
-        result = outliers(thumbnails, shares, lambda: flow_thumbnail(view))
+        shape = good[1].shape
+        result = outliers(thumbnails, shares, lambda: flow_thumbnail(view, shape))
         bad += [(names[k], reason) for k, reason in sorted(result.reasons.items())]
-        notes += [result.note] if result.note else []
+        notes += [f"view '{view.name}': {result.note}"] if result.note else []
     if good is None:
         name, why = bad[0]
         raise InputError(

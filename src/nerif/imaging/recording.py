@@ -298,9 +298,12 @@ def camera_of(view: View, calibrated: CalibratedCamera, shape: tuple[int, int]) 
     if crop is not None and calibrated.image_size == frame and not turned:
         return calibrated.camera().view(crop.row, crop.column, *shape)
     remedy = "calibrate with the same crop, or with the whole frame and no flip"
-    if calibrated.image_size == shape[::-1]:
-        remedy = "is the size of the calibration (width, height), or are the images rotated? " + remedy.capitalize()
-    if not is_binned and calibrated.image_size == (stored[0] // 2, stored[1] // 2):
+    if shape[0] != shape[1] and calibrated.image_size == shape[::-1] and crop is None:
+        remedy = (
+            "is the size of the calibration (width, height), or are the images rotated? If rows and columns are "
+            'exchanged (arrays of MATLAB), give rotate = 90, flip = "vertical" in views.toml'
+        )
+    elif not is_binned and calibrated.image_size == (stored[0] // 2, stored[1] // 2):
         remedy += '; if its target images were binned as a raw Bayer mosaic, set mosaic = "RGGB" in views.toml'
     raise InputError(
         f"its images have {shape[0]} x {shape[1]} px (height x width), its camera was calibrated "

@@ -11,11 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from nerif.common.conventions import InputError
 from nerif.imaging.displacement.noise import local_correlation
 from nerif.imaging.readers.exposure import saturated
-from nerif.imaging.readers.views import Images, View, read_sample
-from nerif.imaging.thumbnails import TILE, Thumbnail, local_displacement, match, shifted
+from nerif.imaging.readers.views import Images, View
+from nerif.imaging.thumbnails import TILE, Thumbnail, local_displacement, match, shifted, thumbnails
 
 __all__ = ["Outliers", "flow_thumbnail", "outliers", "without_outliers"]
 
@@ -85,8 +84,11 @@ def outliers(
 def without_outliers(view: View, images: Images, say: Callable[[str], None]) -> Images:
     """Return the reference images of a view that agree with one another; report the others."""
     full = view.full_scale
-    checks = [(Thumbnail.of(image), float(np.mean(saturated(image, full)))) for image in images]
-    result = outliers(*zip(*checks, strict=True), lambda: flow_thumbnail(view))
+    small, shares = [], []
+    for image in images:  # read once
+        small.append(Thumbnail.of(image))
+        shares.append(float(np.mean(saturated(image, full))))
+    result = outliers(small, shares, lambda: flow_thumbnail(view, images[0].shape))
     for i, reason in sorted(result.reasons.items()):
         say(f"left out: {images.name(i)}: {reason}")
     if result.note:
@@ -94,13 +96,9 @@ def without_outliers(view: View, images: Images, say: Callable[[str], None]) -> 
     return images.select([i for i in range(len(images)) if i not in result.reasons])
 
 
-def flow_thumbnail(view: View) -> Thumbnail | None:
-    """Return an image with flow; None if none of a few can be read, or fits the references."""
-    shape = view.open("reference").shape
-    for _, _, image in read_sample(view, "flow", 3):
-        if not isinstance(image, InputError) and view.open("flow").shape == shape:
-            return Thumbnail.of(image)
-    return None
+def flow_thumbnail(view: View, shape: tuple[int, ...]) -> Thumbnail | None:
+    """Return an image with flow of this shape; None if a few have none."""
+    return next(thumbnails(view, "flow", 3, shape), None)
 
 
 def _overexposed(shares: Sequence[float]) -> dict[int, str]:

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Complex, Float, Shaped
 
+from nerif.common.conventions import InputError
 from nerif.imaging.readers.frames import as_float
+from nerif.imaging.readers.views import View, read_sample
 
-__all__ = ["Thumbnail", "binned", "local_displacement", "match", "related", "shifted"]
+__all__ = ["Thumbnail", "binned", "local_displacement", "match", "related", "shifted", "thumbnails"]
 
 LONGEST = 256  # px of the longer side
 COARSE = 6.0  # px, standard deviation of the mean that is subtracted: vignettes and lamps are alike in all scenes
@@ -72,6 +74,16 @@ class Thumbnail:
         norm = float(np.linalg.norm(faded))
         spectrum = fft.rfft2((faded / norm if norm else faded).astype(np.float32))
         return cls(detail.astype(np.float32), spectrum, binning, grey)
+
+
+def thumbnails(view: View, source: str, most: int, shape: tuple[int, ...]) -> Iterator[Thumbnail]:
+    """Yield the thumbnails of up to `most` images of a source, those that can be read and have this shape."""
+    try:
+        for _, _, image in read_sample(view, source, most):
+            if not isinstance(image, InputError) and image.shape == shape:
+                yield Thumbnail.of(image)
+    except InputError:  # no such images, reported elsewhere
+        return
 
 
 def binned(image: Shaped[np.ndarray, "row column"], binning: int) -> Float[np.ndarray, "row column"]:

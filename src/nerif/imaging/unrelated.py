@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Shaped
 
-from nerif.common.conventions import InputError
-from nerif.imaging.readers.views import View, read_sample
-from nerif.imaging.thumbnails import Thumbnail, related
+from nerif.imaging.readers.views import View
+from nerif.imaging.thumbnails import Thumbnail, related, thumbnails
 
 __all__ = ["unrelated"]
 
@@ -29,26 +28,16 @@ def unrelated(reference: Grey, flow: Grey, view: View, views: Sequence[View]) ->
     if related(still, moving):
         return ""
     text = f"does not correlate with the references of view '{view.name}'"
-    if any(related(still, other) for other in _thumbnails(view, "flow", FRAMES, flow.shape)):
+    if any(related(still, other) for other in thumbnails(view, "flow", FRAMES, flow.shape)):
         return f"{text}, but other flow images do; another scene, or badly exposed?"
     for other in views:
         if other.name == view.name:
             continue
-        if any(related(r, moving) for r in _thumbnails(other, "reference", 1, flow.shape)):
+        if any(related(r, moving) for r in thumbnails(other, "reference", 1, flow.shape)):
             return f"{text}, but with those of view '{other.name}'; exchanged?"
-        if any(related(still, f) for f in _thumbnails(other, "flow", 1, flow.shape)):
+        if any(related(still, f) for f in thumbnails(other, "flow", 1, flow.shape)):
             return f"{text}; these match the flow images of view '{other.name}'; references exchanged?"
     return (
         f"{text}, nor do other flow images; are the references of another run or camera, images out of focus, or "
         "displacements too large?"
     )
-
-
-def _thumbnails(view: View, source: str, most: int, shape: tuple[int, ...]) -> Iterator[Thumbnail]:
-    """Thumbnails of the readable images of a source that have this shape."""
-    try:
-        for _, _, image in read_sample(view, source, most):
-            if not isinstance(image, InputError) and image.shape == shape:
-                yield Thumbnail.of(image)
-    except InputError:  # the view has no such images, reported elsewhere
-        return

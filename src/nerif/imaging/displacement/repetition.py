@@ -102,16 +102,16 @@ def _of_window(window: np.ndarray) -> Repetition | None:
         peaks = 1 + np.flatnonzero((inner > profile[:-2]) & (inner >= profile[2:]) & (inner > HEIGHT))
         across = np.array([-direction[1], direction[0]])
         return Repetition(tuple(across * (k + _fit(*profile[k - 1 : k + 2])[0]) for k in peaks[:1]), direction)
-    peaks = []  # shift and height
+    maxima: list[tuple[np.ndarray, float]] = []  # shift and height
     for r, c in np.argwhere((surface == maximum_filter(surface, 3)) & (surface > HEIGHT)):
         if 0 < r < len(surface) - 1 and 0 < c < surface.shape[1] - 1:
             (x, left), (y, up) = _fit(*surface[r, c - 1 : c + 2]), _fit(*surface[r - 1 : r + 2, c])
             shift = np.array([c + x - column, r + y - row])
             positive = shift[0] > 0.5 or (abs(shift[0]) <= 0.5 and shift[1] > 0)
             if positive and SHORTEST <= np.linalg.norm(shift) <= reach:
-                peaks.append((shift, left + up - surface[r, c]))
-    least = NEARLY * max((height for _, height in peaks), default=0.0)
-    shifts = sorted((shift for shift, height in peaks if height > least), key=np.linalg.norm)
+                maxima.append((shift, left + up - surface[r, c]))
+    least = NEARLY * max((height for _, height in maxima), default=0.0)
+    shifts = sorted((shift for shift, height in maxima if height > least), key=np.linalg.norm)
     if not shifts:
         return None
     return Repetition((shifts[0], *[s for s in shifts if _angle(s, shifts[0]) > DISTINCT][:1]))
@@ -158,7 +158,7 @@ def _median(results: Sequence[Repetition], binning: int) -> Repetition | None:
     """Median of the repetitions of windows, with as many periods as most have; None if they differ."""
     lines = None if results[0].lines is None else _mean_direction([r.lines for r in results if r.lines is not None])
     count = int(np.median([len(r.periods) for r in results]))
-    periods = []
+    periods: list[np.ndarray] = []
     for k in range(count):
         candidates = [r.periods[j] for r in results for j in range(len(r.periods)) if j < count]
         first = periods[0] if periods else results[0].periods[0]

@@ -12,6 +12,8 @@ from nerif.imaging.readers.frames import Frames
 
 __all__ = ["ArrayFrames", "Hdf5Frames"]
 
+MATLAB = "MATLAB_class"  # attribute of the datasets of its .mat files of version 7.3
+
 
 class ArrayFrames(Frames):
     """A NumPy array of an .npy file (memory-mapped) or an .npz file (read whole: it has no partial access)."""
@@ -63,6 +65,8 @@ class Hdf5Frames(Frames):
     """A dataset (frame, row, column) or (row, column) of an HDF5 file.
 
     Times (s) are in its attribute `times` or in a dataset `times` beside it, effective bits in the attribute `bits`.
+    MATLAB stores images(:, :, k) by columns, as (frame, column, row): `save -v7.3` marks them, and they are transposed;
+    `h5write` leaves no mark, and views.toml has to transpose them: rotate = 90, flip = "vertical".
     """
 
     def __init__(self, path: Path, name: str, dataset: str) -> None:
@@ -78,7 +82,8 @@ class Hdf5Frames(Frames):
                 self._stack, self._length = data.ndim == 3, len(data) if data.ndim == 3 else 1
                 bits = data.attrs.get("bits")
                 times = data.attrs.get("times", data.parent.get("times"))
-                times = None if times is None else np.atleast_1d(np.array(times, dtype=float))
+                times = None if times is None else np.array(times, dtype=float).ravel()
+                self._transposed = MATLAB in data.attrs
         except InputError:
             raise
         except Exception as error:
@@ -100,4 +105,5 @@ class Hdf5Frames(Frames):
         import h5py
 
         with h5py.File(self._path, "r") as file:
-            return file[self._key][i] if self._stack else file[self._key][()]
+            image = file[self._key][i] if self._stack else file[self._key][()]
+        return np.ascontiguousarray(image.T) if self._transposed else image

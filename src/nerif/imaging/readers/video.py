@@ -39,7 +39,7 @@ class VideoFrames(Frames):
         self._lock = threading.Lock()  # of the decoder
         av = _av()
         try:
-            with av.open(f"file:{path}") as film:
+            with av.open(f"file:{path}", metadata_errors="replace") as film:
                 stream: Any = next(iter(film.streams.video), None)
                 context = stream and stream.codec_context
                 if context is None or not context.pix_fmt:
