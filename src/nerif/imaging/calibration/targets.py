@@ -11,13 +11,16 @@ from jaxtyping import Float, Int
 
 from nerif.common.conventions import InputError
 from nerif.common.settings import check_settings
+from nerif.imaging.calibration.dot_grid import dot_grid, find_dots
 
-__all__ = ["KINDS", "CalibrationTarget", "Detection", "ViewImages", "eight_bit", "saddle_points"]
+__all__ = ["KINDS", "CalibrationTarget", "Detection", "ViewImages", "eight_bit", "marker_parameters", "saddle_points"]
 
 KINDS = ("chessboard", "charuco", "circles")
 DICTIONARY = "DICT_4X4_250"
 MARKER = 0.6  # edge of a marker over that of a square
 MIN_POINTS = 6  # of a detection
+MIN_EDGE = 8.0  # of a marker, px
+TURN = np.radians(20.0)  # of a grid of dots in the image, least ambiguous
 
 
 @dataclass(frozen=True)
@@ -29,11 +32,13 @@ class Detection:
     ids : (n,) their numbers on the target
     pixels : (n, 2) their places in the image, px
     points : (n, 3) their places on the target, mm
+    negative : the target is white on black
     """
 
     ids: Int[np.ndarray, " n"]
     pixels: Float[np.ndarray, "n 2"]
     points: Float[np.ndarray, "n 3"]
+    negative: bool = False
 
 
 @dataclass(frozen=True)
@@ -72,7 +77,7 @@ class CalibrationTarget:
     """
 
     kind: Literal[*KINDS] = "charuco"  # type: ignore[valid-type]
-    """chessboard, charuco or circles (a regular grid of black dots)."""
+    """chessboard, charuco or circles (a regular grid of dots, black on white or white on black)."""
     columns: int = 12
     """Number of squares (circles: dots) along a row."""
     rows: int = 9
@@ -155,25 +160,42 @@ class CalibrationTarget:
         """Return the exact pixel size of `raster`, mm."""
         return self.pitch / max(8, round(self.pitch / pixel))
 
-    def detect(self, image: np.ndarray) -> Detection | None:
-        """Return the target in an image (8 to 16 bit or float), or None."""
-        import cv2
+    def detect(self, image: np.ndarray, negative: bool = False) -> Detection | None:
+        """Return the target in an image (8 to 16 bit or float), black on white or white on black, or None.
 
+        Parameters
+        ----------
+        negative : look first for white on black
+        """
         image = eight_bit(image)
         if self.kind == "chessboard":
-            flags = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
-            success, corners = cv2.findChessboardCornersSB(image, self.shape, flags=flags)
-            if not success:
-                return None
-            pixels = _from_black_square(image, corners.reshape(-1, 2).astype(np.float64), self.shape)
-            return self._refined(image, np.arange(len(pixels)), pixels, 0.5)
-        if self.kind == "circles":
-            success, corners = cv2.findCirclesGrid(image, self.shape, flags=cv2.CALIB_CB_SYMMETRIC_GRID)
-            if not success:
-                return None
-            pixels = _from_upper_left(corners.reshape(-1, 2).astype(np.float64), self.shape)
-            return Detection(np.arange(len(pixels)), pixels, self.points)
-        corners, ids, _, _ = cv2.aruco.CharucoDetector(self._board()).detectBoard(image)
+            return self._chessboard(image)
+        detect = self._circles if self.kind == "circles" else self._charuco
+        for inverse in (negative, not negative):
+            if detection := detect(255 - image if inverse else image):
+                return replace(detection, negative=inverse)
+        return None
+
+    def _chessboard(self, image: np.ndarray) -> Detection | None:
+        import cv2
+
+        flags = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
+        success, corners = cv2.findChessboardCornersSB(image, self.shape, flags=flags)
+        if not success:
+            return None
+        pixels = _from_black_square(image, corners.reshape(-1, 2).astype(np.float64), self.shape)
+        return self._refined(image, np.arange(len(pixels)), pixels, 0.5)
+
+    def _circles(self, image: np.ndarray) -> Detection | None:
+        grid = dot_grid(*find_dots(image, self.columns * self.rows))
+        pixels = None if grid is None else _upright(grid.centres, self.shape)
+        return None if pixels is None else Detection(np.arange(len(pixels)), pixels, self.points)
+
+    def _charuco(self, image: np.ndarray) -> Detection | None:
+        import cv2
+
+        detector = cv2.aruco.CharucoDetector(self._board(), detectorParams=marker_parameters(image))
+        corners, ids, _, _ = detector.detectBoard(image)
         if ids is None or len(ids) < MIN_POINTS:
             return None
         gap = (1 - (self.marker or MARKER * self.pitch) / self.pitch) / 2
@@ -200,6 +222,15 @@ class CalibrationTarget:
         )
         board.setLegacyPattern(self.legacy)
         return board
+
+
+def marker_parameters(image: np.ndarray, edge: float = MIN_EDGE) -> Any:
+    """Return OpenCV's parameters for markers with edges of at least `edge` px; its own limit grows with the image."""
+    import cv2
+
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.minMarkerPerimeterRate = min(parameters.minMarkerPerimeterRate, 4 * edge / max(image.shape))
+    return parameters
 
 
 def eight_bit(image: np.ndarray) -> np.ndarray:
@@ -260,13 +291,21 @@ def _sample(image: np.ndarray, where: np.ndarray) -> float:
     return float(image[max(v - 1, 0) : v + 2, max(u - 1, 0) : u + 2].mean())
 
 
-def _from_upper_left(pixels: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Order circles so that rows go down and columns to the right in the image."""
+def _upright(centres: np.ndarray, shape: tuple[int, int]) -> np.ndarray | None:
+    """Order dots so that columns go to the right and rows down in the image; None if the numbers differ.
+
+    Where columns and rows are exchanged, columns go down, which is as far from a turn by 180 degrees.
+    """
     columns, rows = shape
-    grid = pixels.reshape(rows, columns, 2)
-    if grid[0, 0, 1] + grid[0, -1, 1] > grid[-1, 0, 1] + grid[-1, -1, 1]:
-        grid = grid[::-1, ::-1]
-    return grid.reshape(-1, 2)
+    turned = (np.rot90(centres, turns) for turns in range(4))
+    grids = [grid for grid in turned if grid.shape[:2] == (rows, columns)]
+    return max(grids, key=_turned_little).reshape(-1, 2) if grids else None
+
+
+def _turned_little(grid: np.ndarray) -> float:
+    """Cosine of the angle from TURN to the way of the columns in the image."""
+    x, y = (grid[:, -1] - grid[:, 0]).mean(axis=0)
+    return float((x * np.cos(TURN) + y * np.sin(TURN)) / np.hypot(x, y))
 
 
 def _spacing(pixels: np.ndarray, ids: np.ndarray, shape: tuple[int, int]) -> float:
