@@ -48,10 +48,10 @@ def find_dots(image: np.ndarray, count: int) -> tuple[Float[np.ndarray, "n 2"], 
     """
     import cv2
 
-    parameters = cv2.SimpleBlobDetector_Params()
+    parameters = cv2.SimpleBlobDetector.Params()
     parameters.maxArea = image.size / count
     parameters.collectContours = True
-    detector = cv2.SimpleBlobDetector_create(parameters)
+    detector = cv2.SimpleBlobDetector.create(parameters)
     dots = detector.detect(image)
     if dots and np.median([_fill(contour) for contour in detector.getBlobContours()]) > MAX_FILL:
         dots = []  # squares of a chessboard, or markers

@@ -149,7 +149,7 @@ class VideoFrames(Frames):
         """Set the decoder to a key frame."""
         if self._film is not None:
             self._film.close()
-        self._film = _av().open(f"file:{self._path}")
+        self._film = _av().open(f"file:{self._path}", metadata_errors="replace")
         stream = self._film.streams.video[0]
         if key:
             next(self._film.decode(stream))  # has the palette of all frames, if there is one
