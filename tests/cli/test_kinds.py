@@ -37,8 +37,8 @@ FILES = {
 }  # fmt: skip
 STORES = (kinds.SEQUENCE_RESULT, kinds.TRUE_SEQUENCE)
 COMMANDS: dict[str, tuple[Kind, ...]] = {
-    "info {}": (kinds.MEASUREMENT, kinds.VOLUME, kinds.RESULT),
-    "check {}": (kinds.MEASUREMENT,),
+    "info {}": (kinds.MEASUREMENT, kinds.VOLUME, kinds.RESULT, kinds.SEQUENCE),
+    "check {}": (kinds.MEASUREMENT, kinds.SEQUENCE),
     "mask {} -o new.nc": (kinds.MEASUREMENT,),
     "reconstruct {} -o new": (kinds.MEASUREMENT,),
     "displacement {} --calibration calibration.toml -o new.nc": (kinds.EXPERIMENT,),
