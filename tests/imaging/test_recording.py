@@ -87,7 +87,7 @@ def test_a_film_gives_the_measurement_of_its_images(recording, tmp_path, lines):
     (note,) = lines  # once, though two sources have it
     assert note.startswith(f"note: {view.name}/run.cine: shown flipped")
     stack = ViewReference.of(recording, view)
-    (_, ours, _), (_, theirs, _) = film.measure([1]), stack.measure([1])
+    ours, theirs = film.measure([1]).result, stack.measure([1]).result
     np.testing.assert_array_equal(ours.displacement, theirs.displacement)
     np.testing.assert_array_equal(ours.valid, theirs.valid)
 
