@@ -1,0 +1,327 @@
+"""Which target is in images where the one of the settings is not detected, or why none is.
+
+Tried in this order: ChArUco boards with the dictionaries of OpenCV, as they are and mirrored, chessboards of other
+numbers of squares, and grids of dots. A ChArUco board or chessboard is named only if it is then detected as such.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from itertools import groupby
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from nerif.common.conventions import InputError
+from nerif.imaging.calibration.dot_grid import dot_grid, find_dots
+from nerif.imaging.calibration.targets import CalibrationTarget, eight_bit, marker_parameters
+from nerif.imaging.readers.exposure import check_exposure
+
+__all__ = ["Identification", "explain", "identify"]
+
+MIN_MARKERS = 6  # of a board
+MIN_SHARE = 0.75  # of the markers, in the layout of a board
+MAX_OFFSET = 0.25  # of a marker from its square, in squares
+COUNTS = range(4, 41)  # of columns to try
+IDS = 250  # of a dictionary that are tried, or as many as the board has
+CANDIDATE_EDGE, CELL = 4.0, 2.0  # px: smallest square that could be a marker; least size of a cell to be read
+MAX_EDGE_WIDTH = 8.0  # px, of sharp images
+OVEREXPOSED = 0.25  # share of the pixels
+
+
+@dataclass(frozen=True)
+class Identification:
+    """A target that fits an image.
+
+    Parameters
+    ----------
+    target : as in the settings, but for what differs; None if it is one that is not supported
+    mirrored : the image has to be flipped first
+    text : the target in words
+    """
+
+    target: CalibrationTarget | None
+    text: str
+    mirrored: bool = False
+
+
+@dataclass(frozen=True)
+class _Markers:
+    """Markers of a family of dictionaries in an image.
+
+    Parameters
+    ----------
+    family : names of the dictionaries with the same first markers, from the smallest
+    centres : px
+    """
+
+    family: tuple[str, ...]
+    ids: Int[np.ndarray, " n"]
+    centres: Float[np.ndarray, "n 2"]
+
+
+def explain(images: Sequence[np.ndarray], target: CalibrationTarget, full: float, flip: str = "") -> str:
+    """Return why a target is not detected in images: another one is there, they are mirrored, or they are too bad.
+
+    Parameters
+    ----------
+    images : some of those without a detection
+    full : full scale, grey values
+    flip : that of the view's settings
+    """
+    identification = identify(images, target)
+    if identification is None:
+        return _no_target(images, target, full)
+    if identification.target is None:
+        return identification.text
+    options = " ".join(_options(identification.target, target))
+    parts = [f"the target is {identification.text}, not {_name(target)}: give {options}"] if options else []
+    if identification.mirrored:
+        remedy = f'remove flip = "{flip}" from' if flip in ("horizontal", "vertical") else 'put flip = "horizontal" into'
+        parts.append(f"the images are mirrored: {remedy} views.toml")
+    return "; ".join(parts) or f"{identification.text} is detected only in part"
+
+
+def identify(images: Sequence[np.ndarray], target: CalibrationTarget) -> Identification | None:
+    """Return the target that fits the images, or None."""
+    pictures = [eight_bit(image) for image in images]
+    for search in (_charuco, _chessboard, _circles):
+        if identification := search(pictures, target):
+            return identification
+    return None
+
+
+def _name(target: CalibrationTarget) -> str:
+    text = f"{target.kind} {target.columns} x {target.rows}"
+    if target.kind != "charuco":
+        return text
+    return f"{text} of {target.dictionary}{', legacy pattern' if target.legacy else ''}"
+
+
+def _options(target: CalibrationTarget, settings: CalibrationTarget) -> Iterator[str]:
+    """Options of the command line that turn the settings into the target."""
+    for name in ("kind", "columns", "rows", "dictionary"):
+        if getattr(target, name) != getattr(settings, name):
+            yield f"--target.{name} {getattr(target, name)}"
+    if target.legacy != settings.legacy:
+        yield "--target.legacy" if target.legacy else "--target.no-legacy"
+
+
+# -- ChArUco -------------------------------------------------------------------------------------------------------
+
+
+def _charuco(images: Sequence[np.ndarray], target: CalibrationTarget) -> Identification | None:
+    elsewhere: _Markers | None = None
+    for image in images:
+        for mirrored in (False, True):
+            picture = np.ascontiguousarray(image[:, ::-1]) if mirrored else image
+            for markers in _markers(picture, target):
+                if len(markers.ids) < MIN_MARKERS:
+                    continue
+                board = _board_of(markers, target)
+                if board is not None and board.detect(picture) is not None:
+                    return Identification(board, _name(board), mirrored)
+                elsewhere = elsewhere or markers
+    if elsewhere is None or len(set(elsewhere.ids)) < len(elsewhere.ids) / 2:
+        return None
+    return Identification(
+        None,
+        f"{len(elsewhere.ids)} markers of {elsewhere.family[-1]} (ids {elsewhere.ids.min()} to {elsewhere.ids.max()}) "
+        "were detected, but not in the layout of a ChArUco board with ids from 0; grids of markers without a "
+        "chessboard are not supported, print one with nerif pattern --kind charuco",
+    )
+
+
+@cache
+def _families() -> tuple[tuple[str, ...], ...]:
+    """Names of OpenCV's dictionaries; DICT_4X4_50 holds the first markers of DICT_4X4_100."""
+    from cv2 import aruco
+
+    values = {getattr(aruco, name): name for name in sorted(dir(aruco)) if name.startswith("DICT_")}  # one of aliases
+
+    def family(name: str) -> str:
+        return name if "APRILTAG" in name or "ARUCO" in name else name.rpartition("_")[0]
+
+    names = sorted(values.values(), key=lambda n: (family(n), _size(n)))
+    return tuple(tuple(group) for _, group in groupby(names, key=family))
+
+
+def _dictionary(name: str) -> Any:
+    from cv2 import aruco
+
+    return aruco.getPredefinedDictionary(getattr(aruco, name))
+
+
+def _size(name: str) -> int:
+    return len(_dictionary(name).bytesList)
+
+
+def _markers(image: np.ndarray, target: CalibrationTarget) -> list[_Markers]:
+    """Markers of all dictionaries in an image, black on white or white on black; those with the most first."""
+    from cv2 import aruco
+
+    parameters = marker_parameters(image)
+    parameters.detectInvertedMarker = True
+    count = max(IDS, target.columns * target.rows // 2)
+    shortened = []
+    for family in _families():
+        full = _dictionary(family[-1])
+        shortened.append(aruco.Dictionary(full.bytesList[:count], full.markerSize, full.maxCorrectionBits))
+    corners, ids, _, numbers = aruco.ArucoDetector(shortened, parameters).detectMarkersMultiDict(image)
+    if ids is None or not len(ids):
+        return []
+    centres = np.array([c.reshape(4, 2).mean(axis=0) for c in corners], dtype=np.float64)
+    ids, numbers = np.ravel(ids).astype(np.int64), np.ravel(numbers)
+    groups = [_Markers(f, ids[numbers == i], centres[numbers == i]) for i, f in enumerate(_families())]
+    return sorted((g for g in groups if len(g.ids)), key=lambda g: -len(g.ids))
+
+
+def _squares(columns: int, legacy: bool, count: int) -> Int[np.ndarray, "count 2"]:
+    """Column and row of the first markers of a board; the legacy layout as it is for even numbers of rows."""
+    row, column = np.divmod(np.arange(columns * (2 * count // columns + 2)), columns)
+    with_marker = (row + column) % 2 == (0 if legacy else 1)
+    return np.stack([column, row], axis=-1)[with_marker][:count]
+
+
+def _board_of(markers: _Markers, target: CalibrationTarget) -> CalibrationTarget | None:
+    """The board whose layout the markers have, or None; of several that fit, the one nearest the settings."""
+    even = target.legacy and target.rows % 2 == 0
+    columns = dict.fromkeys([target.columns, target.rows, *COUNTS])
+    for count in columns:
+        for legacy in (even, not even):
+            rows = _rows_in_layout(markers, count, legacy)
+            if rows is None:
+                continue
+            expected = {target.columns: target.rows, target.rows: target.columns}.get(count, rows)
+            rows = max(expected, rows, 4)
+            rows += legacy and rows % 2  # an odd number has no legacy layout: the last row is not in the image
+            legacy = legacy if rows % 2 == 0 else target.legacy
+            return replace(
+                target, kind="charuco", columns=count, rows=rows, legacy=legacy,
+                dictionary=_smallest(markers.family, count * rows // 2, target.dictionary),
+            )  # fmt: skip
+    return None
+
+
+def _rows_in_layout(markers: _Markers, columns: int, legacy: bool) -> int | None:
+    """Number of rows up to the last marker if a homography maps the markers to their squares, not mirrored."""
+    import cv2
+
+    squares = _squares(columns, legacy, int(markers.ids.max()) + 1)[markers.ids].astype(np.float64)
+    if len(np.unique(squares[:, 1])) < 2:
+        return None
+    homography, fits = cv2.findHomography(markers.centres, squares, cv2.RANSAC, MAX_OFFSET)
+    if homography is None or fits.mean() < MIN_SHARE or fits.sum() < MIN_MARKERS:
+        return None
+    if np.linalg.det(homography) * (homography[2] @ [*markers.centres.mean(axis=0), 1]) < 0:
+        return None
+    return int(squares[fits.ravel() > 0, 1].max()) + 1
+
+
+def _smallest(family: tuple[str, ...], count: int, preferred: str) -> str:
+    """The dictionary of the settings if it has these markers, else the smallest one that has enough."""
+    from cv2 import aruco
+
+    for name in family:
+        if getattr(aruco, name) == getattr(aruco, preferred, None) and _size(name) >= count:
+            return preferred
+    return next((name for name in family if _size(name) >= count), family[-1])
+
+
+# -- chessboards and dots ------------------------------------------------------------------------------------------
+
+
+def _chessboard(images: Sequence[np.ndarray], target: CalibrationTarget) -> Identification | None:
+    """The chessboard that is detected in most of the images."""
+    import cv2
+
+    sizes: dict[tuple[int, int], None] = {(target.columns, target.rows): None}  # of corners, if these were given
+    for image in images:
+        flags = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_LARGER
+        success, _, meta = cv2.findChessboardCornersSBWithMeta(image, (3, 3), flags)
+        if success and meta.size >= 12:
+            rows, columns = sorted(meta.shape)
+            # the margin of the paper may add a line of corners
+            sizes |= dict.fromkeys((columns - i, rows - j) for i, j in ((0, 0), (1, 0), (0, 1), (1, 1)))
+    if len(sizes) == 1:
+        return None
+    for size in sizes:
+        if min(size) < 3:
+            continue
+        count = sum(bool(cv2.findChessboardCornersSB(i, size, flags=cv2.CALIB_CB_EXHAUSTIVE)[0]) for i in images)
+        if count < max(1, len(images) / 2):
+            continue
+        numbers = sorted((size[0] + 1, size[1] + 1), reverse=target.columns >= target.rows)
+        try:
+            board = replace(target, kind="chessboard", columns=numbers[0], rows=numbers[1])
+        except InputError as error:
+            return Identification(None, f"the target is a chessboard of {numbers[0]} x {numbers[1]} squares; {error}")
+        return Identification(board, _name(board))
+    return None
+
+
+def _circles(images: Sequence[np.ndarray], target: CalibrationTarget) -> Identification | None:
+    for image in images:
+        for picture in (image, 255 - image):
+            grid = dot_grid(*find_dots(picture, target.columns * target.rows))
+            if grid is None:
+                continue
+            if grid.asymmetric:
+                return Identification(
+                    None,
+                    f"the target is an asymmetric grid of {grid.count} dots, which is not supported; use a regular "
+                    "grid of dots, or print a board with nerif pattern --kind charuco",
+                )
+            rows, columns = grid.centres.shape[:2]
+            numbers = sorted((columns, rows), reverse=target.columns >= target.rows)
+            found = replace(target, kind="circles", columns=numbers[0], rows=numbers[1])
+            return Identification(found, _name(found))
+    return None
+
+
+# -- images without a target ---------------------------------------------------------------------------------------
+
+
+def _no_target(images: Sequence[np.ndarray], target: CalibrationTarget, full: float) -> str:
+    """What was detected of the target, and what is wrong with the images, as far as it can be measured."""
+    pictures = [eight_bit(image) for image in images]
+    if target.kind == "charuco":
+        best = max((m for p in pictures for m in _markers(p, target)), key=lambda m: len(m.ids), default=None)
+        if best is None or len(best.ids) < MIN_MARKERS:
+            text = "no marker of any dictionary of OpenCV was detected, no chessboard, no grid of dots"
+        else:
+            text = f"at most {len(best.ids)} markers of {best.family[-1]} were detected in an image, too few for a board"
+    elif target.kind == "circles":
+        count = target.columns * target.rows
+        dots = max(len(find_dots(p, count)[0]) for picture in pictures for p in (picture, 255 - picture))
+        text = f"{dots} dots were detected in an image, in no complete grid, and no other target"
+    else:
+        text = "no chessboard of any number of squares was detected, and no other target"
+    faults = [_fault(image, picture, target, full) for image, picture in zip(images, pictures, strict=True)]
+    return f"{text}; {next(filter(None, faults), 'is it in focus, evenly lit and large enough, and in the images?')}"
+
+
+def _fault(image: np.ndarray, picture: np.ndarray, target: CalibrationTarget, full: float) -> str:
+    """The fault of an image, and of the same in eight bits."""
+    import cv2
+
+    if exposure := check_exposure(image, full, "exposure", OVEREXPOSED):
+        return exposure
+    smooth = cv2.GaussianBlur(picture.astype(np.float32), (0, 0), 1.0)
+    slope = np.hypot(cv2.Sobel(smooth, cv2.CV_32F, 1, 0, scale=1 / 8), cv2.Sobel(smooth, cv2.CV_32F, 0, 1, scale=1 / 8))
+    width = float(np.ptp(np.percentile(smooth, (1, 99)))) / max(float(np.percentile(slope, 99.9)), 1e-6)
+    if width > MAX_EDGE_WIDTH:
+        return f"the sharpest edges in an image are {width:.0f} px wide: out of focus, or the target moved"
+    if target.kind != "charuco":
+        return ""
+    dictionary = _dictionary(target.dictionary)
+    detector = cv2.aruco.ArucoDetector(dictionary, marker_parameters(picture, CANDIDATE_EDGE))
+    _, _, candidates = detector.detectMarkers(picture)
+    least = CELL * (dictionary.markerSize + 2)
+    edge = float(np.median([np.sqrt(cv2.contourArea(c)) for c in candidates])) if len(candidates) else least
+    if len(candidates) >= MIN_MARKERS and edge < least:
+        return f"the squares in an image are about {edge:.0f} px wide, and a marker needs {least:.0f} px or more"
+    return ""
