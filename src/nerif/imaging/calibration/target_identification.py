@@ -15,20 +15,21 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from nerif.common.conventions import InputError
 from nerif.imaging.calibration.dot_grid import dot_grid, find_dots
-from nerif.imaging.calibration.targets import CalibrationTarget, eight_bit, marker_parameters
+from nerif.imaging.calibration.targets import MAX_OFFSET, CalibrationTarget, eight_bit, marker_parameters, marker_squares
 from nerif.imaging.readers.exposure import check_exposure
 
 __all__ = ["Identification", "explain", "identify"]
 
 MIN_MARKERS = 6  # of a board
 MIN_SHARE = 0.75  # of the markers, in the layout of a board
-MAX_OFFSET = 0.25  # of a marker from its square, in squares
+MIN_COUNT = 12  # squares between the corners of a chessboard, or dots: fewer are found in any texture
 COUNTS = range(4, 41)  # of columns to try
 IDS = 250  # of a dictionary that are tried, or as many as the board has
 CANDIDATE_EDGE, CELL = 4.0, 2.0  # px: smallest square that could be a marker; least size of a cell to be read
+MIN_CONTRAST = 3.0  # of a smoothed image, over the noise of its pixels; it is 1.3 in pure noise
 MAX_EDGE_WIDTH = 8.0  # px, of sharp images
+MAX_VARIANCE = 0.03  # of the squares of a chessboard, beside their two colours, over that of all
 OVEREXPOSED = 0.25  # share of the pixels
 
 
@@ -56,11 +57,13 @@ class _Markers:
     ----------
     family : names of the dictionaries with the same first markers, from the smallest
     centres : px
+    size : height and width of the image, px
     """
 
     family: tuple[str, ...]
     ids: Int[np.ndarray, " n"]
     centres: Float[np.ndarray, "n 2"]
+    size: tuple[int, int]
 
 
 def explain(images: Sequence[np.ndarray], target: CalibrationTarget, full: float, flip: str = "") -> str:
@@ -82,7 +85,7 @@ def explain(images: Sequence[np.ndarray], target: CalibrationTarget, full: float
     if identification.mirrored:
         remedy = f'remove flip = "{flip}" from' if flip in ("horizontal", "vertical") else 'put flip = "horizontal" into'
         parts.append(f"the images are mirrored: {remedy} views.toml")
-    return "; ".join(parts) or f"{identification.text} is detected only in part"
+    return "; ".join(parts) or _no_target(images, target, full)
 
 
 def identify(images: Sequence[np.ndarray], target: CalibrationTarget) -> Identification | None:
@@ -175,15 +178,8 @@ def _markers(image: np.ndarray, target: CalibrationTarget) -> list[_Markers]:
         return []
     centres = np.array([c.reshape(4, 2).mean(axis=0) for c in corners], dtype=np.float64)
     ids, numbers = np.ravel(ids).astype(np.int64), np.ravel(numbers)
-    groups = [_Markers(f, ids[numbers == i], centres[numbers == i]) for i, f in enumerate(_families())]
+    groups = [_Markers(f, ids[numbers == i], centres[numbers == i], image.shape) for i, f in enumerate(_families())]
     return sorted((g for g in groups if len(g.ids)), key=lambda g: -len(g.ids))
-
-
-def _squares(columns: int, legacy: bool, count: int) -> Int[np.ndarray, "count 2"]:
-    """Column and row of the first markers of a board; the legacy layout as it is for even numbers of rows."""
-    row, column = np.divmod(np.arange(columns * (2 * count // columns + 2)), columns)
-    with_marker = (row + column) % 2 == (0 if legacy else 1)
-    return np.stack([column, row], axis=-1)[with_marker][:count]
 
 
 def _board_of(markers: _Markers, target: CalibrationTarget) -> CalibrationTarget | None:
@@ -192,11 +188,12 @@ def _board_of(markers: _Markers, target: CalibrationTarget) -> CalibrationTarget
     columns = dict.fromkeys([target.columns, target.rows, *COUNTS])
     for count in columns:
         for legacy in (even, not even):
-            rows = _rows_in_layout(markers, count, legacy)
-            if rows is None:
+            layout = _rows_in_layout(markers, count, legacy)
+            if layout is None:
                 continue
-            expected = {target.columns: target.rows, target.rows: target.columns}.get(count, rows)
-            rows = max(expected, rows, 4)
+            rows, whole = layout
+            exchanged = {target.columns: target.rows, target.rows: target.columns}
+            rows = max(rows, 4, exchanged.get(count, rows if whole else target.rows))
             rows += legacy and rows % 2  # an odd number has no legacy layout: the last row is not in the image
             legacy = legacy if rows % 2 == 0 else target.legacy
             return replace(
@@ -206,11 +203,14 @@ def _board_of(markers: _Markers, target: CalibrationTarget) -> CalibrationTarget
     return None
 
 
-def _rows_in_layout(markers: _Markers, columns: int, legacy: bool) -> int | None:
-    """Number of rows up to the last marker if a homography maps the markers to their squares, not mirrored."""
+def _rows_in_layout(markers: _Markers, columns: int, legacy: bool) -> tuple[int, bool] | None:
+    """Number of rows up to the last marker, and whether another row would be in the image.
+
+    None if no homography maps the markers to their squares, or only a mirrored one.
+    """
     import cv2
 
-    squares = _squares(columns, legacy, int(markers.ids.max()) + 1)[markers.ids].astype(np.float64)
+    squares = marker_squares(columns, legacy, int(markers.ids.max()) + 1)[markers.ids].astype(np.float64)
     if len(np.unique(squares[:, 1])) < 2:
         return None
     homography, fits = cv2.findHomography(markers.centres, squares, cv2.RANSAC, MAX_OFFSET)
@@ -218,7 +218,10 @@ def _rows_in_layout(markers: _Markers, columns: int, legacy: bool) -> int | None
         return None
     if np.linalg.det(homography) * (homography[2] @ [*markers.centres.mean(axis=0), 1]) < 0:
         return None
-    return int(squares[fits.ravel() > 0, 1].max()) + 1
+    rows = int(squares[fits.ravel() > 0, 1].max()) + 1
+    below = np.stack([np.arange(columns), np.full(columns, rows)], axis=-1)[None].astype(np.float64)
+    places = cv2.perspectiveTransform(below, np.linalg.inv(homography))[0]
+    return rows, bool(np.mean(((places > 0) & (places < markers.size[::-1])).all(axis=1)) > 0.5)
 
 
 def _smallest(family: tuple[str, ...], count: int, preferred: str) -> str:
@@ -235,39 +238,82 @@ def _smallest(family: tuple[str, ...], count: int, preferred: str) -> str:
 
 
 def _chessboard(images: Sequence[np.ndarray], target: CalibrationTarget) -> Identification | None:
-    """The chessboard that is detected in most of the images."""
+    """The chessboard of most of the images; that of a ChArUco board whose markers are not sharp is none."""
     import cv2
 
-    sizes: dict[tuple[int, int], None] = {(target.columns, target.rows): None}  # of corners, if these were given
+    sizes: dict[tuple[int, int], None] = {}  # numbers of corners
     for image in images:
         flags = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_LARGER
         success, _, meta = cv2.findChessboardCornersSBWithMeta(image, (3, 3), flags)
-        if success and meta.size >= 12:
+        if success:
             rows, columns = sorted(meta.shape)
             # the margin of the paper may add a line of corners
             sizes |= dict.fromkeys((columns - i, rows - j) for i, j in ((0, 0), (1, 0), (0, 1), (1, 1)))
-    if len(sizes) == 1:
-        return None
+    if sizes:  # the numbers of the settings may be those of corners
+        sizes = {(max(target.columns, target.rows), min(target.columns, target.rows)): None} | sizes
     for size in sizes:
-        if min(size) < 3:
+        if not _in_most(images, size):
             continue
-        count = sum(bool(cv2.findChessboardCornersSB(i, size, flags=cv2.CALIB_CB_EXHAUSTIVE)[0]) for i in images)
-        if count < max(1, len(images) / 2):
-            continue
-        numbers = sorted((size[0] + 1, size[1] + 1), reverse=target.columns >= target.rows)
-        try:
-            board = replace(target, kind="chessboard", columns=numbers[0], rows=numbers[1])
-        except InputError as error:
-            return Identification(None, f"the target is a chessboard of {numbers[0]} x {numbers[1]} squares; {error}")
+        columns, rows = sorted((size[0] + 1, size[1] + 1), reverse=target.columns >= target.rows)
+        if target.kind == "charuco" and (columns, rows) == (target.columns, target.rows):
+            return None
+        if (columns + rows) % 2 == 0:
+            return Identification(
+                None,
+                f"the target is a chessboard of {columns} x {rows} squares, which looks the same turned by 180 degrees "
+                "and is not supported; use one of an odd and an even number of squares, or ChArUco",
+            )
+        board = replace(target, kind="chessboard", columns=columns, rows=rows)
         return Identification(board, _name(board))
     return None
+
+
+def _in_most(images: Sequence[np.ndarray], size: tuple[int, int]) -> bool:
+    """Whether at least half of the images have a chessboard of this number of corners."""
+    failures = 0
+    for image in images:
+        failures += not _is_chessboard(image, size)
+        if failures > len(images) / 2:
+            return False
+    return True
+
+
+def _is_chessboard(image: np.ndarray, size: tuple[int, int]) -> bool:
+    """Whether corners are detected, lie in a flat grid, and the squares between them are black and white in turn.
+
+    The detector alone finds small chessboards in textures, and parts of a ChArUco board.
+    """
+    import cv2
+
+    columns, rows = size
+    if min(size) < 3 or (columns - 1) * (rows - 1) < MIN_COUNT:
+        return False
+    success, corners = cv2.findChessboardCornersSB(image, size, flags=cv2.CALIB_CB_EXHAUSTIVE)
+    if not success:
+        return False
+    row, column = np.mgrid[:rows, :columns]
+    grid = np.stack([column, row], axis=-1).reshape(-1, 2).astype(np.float64)
+    homography, _ = cv2.findHomography(grid, corners.reshape(-1, 2))
+    if homography is None:
+        return False
+    places = cv2.perspectiveTransform(corners.reshape(1, -1, 2).astype(np.float64), np.linalg.inv(homography))[0]
+    if np.linalg.norm(places - grid, axis=1).max() > MAX_OFFSET:
+        return False
+    inner = (row < rows - 1) & (column < columns - 1)
+    middles = cv2.perspectiveTransform(grid[None] + 0.5, homography)[0][inner.ravel()].astype(np.float32)
+    grey = cv2.remap(cv2.GaussianBlur(image, (0, 0), 1.5), middles[:, 0], middles[:, 1], cv2.INTER_LINEAR).ravel()
+    colour = np.where((row + column) % 2, 1.0, -1.0)[inner]
+    light = np.stack([np.ones_like(colour), column[inner], row[inner]])  # unevenly lit, in both colours
+    model = np.concatenate([light, colour * light]).T
+    residual = grey - model @ np.linalg.lstsq(model, grey, rcond=None)[0]
+    return float(np.var(residual)) < MAX_VARIANCE * float(np.var(grey))
 
 
 def _circles(images: Sequence[np.ndarray], target: CalibrationTarget) -> Identification | None:
     for image in images:
         for picture in (image, 255 - image):
             grid = dot_grid(*find_dots(picture, target.columns * target.rows))
-            if grid is None:
+            if grid is None or grid.count < min(MIN_COUNT, target.columns * target.rows):
                 continue
             if grid.asymmetric:
                 return Identification(
@@ -311,8 +357,13 @@ def _fault(image: np.ndarray, picture: np.ndarray, target: CalibrationTarget, fu
     if exposure := check_exposure(image, full, "exposure", OVEREXPOSED):
         return exposure
     smooth = cv2.GaussianBlur(picture.astype(np.float32), (0, 0), 1.0)
+    contrast = float(np.ptp(np.percentile(smooth, (1, 99))))
+    curvature = np.diff(picture.astype(np.float32), n=2, axis=1)
+    noise = float(np.median(np.abs(curvature))) / (0.6745 * np.sqrt(6))
+    if contrast < MIN_CONTRAST * noise:
+        return "the contrast of an image is as low as its noise; is it lit, and in focus?"
     slope = np.hypot(cv2.Sobel(smooth, cv2.CV_32F, 1, 0, scale=1 / 8), cv2.Sobel(smooth, cv2.CV_32F, 0, 1, scale=1 / 8))
-    width = float(np.ptp(np.percentile(smooth, (1, 99)))) / max(float(np.percentile(slope, 99.9)), 1e-6)
+    width = contrast / max(float(np.percentile(slope, 99.9)), 1e-6)
     if width > MAX_EDGE_WIDTH:
         return f"the sharpest edges in an image are {width:.0f} px wide: out of focus, or the target moved"
     if target.kind != "charuco":
@@ -321,7 +372,9 @@ def _fault(image: np.ndarray, picture: np.ndarray, target: CalibrationTarget, fu
     detector = cv2.aruco.ArucoDetector(dictionary, marker_parameters(picture, CANDIDATE_EDGE))
     _, _, candidates = detector.detectMarkers(picture)
     least = CELL * (dictionary.markerSize + 2)
-    edge = float(np.median([np.sqrt(cv2.contourArea(c)) for c in candidates])) if len(candidates) else least
-    if len(candidates) >= MIN_MARKERS and edge < least:
-        return f"the squares in an image are about {edge:.0f} px wide, and a marker needs {least:.0f} px or more"
+    if len(candidates) < max(MIN_MARKERS, target.columns * target.rows // 8):  # noise has some
+        return ""
+    edge = float(np.percentile([np.sqrt(cv2.contourArea(c)) for c in candidates], 25))  # squares are larger
+    if edge < least:
+        return f"the markers in an image are about {edge:.0f} px wide, and need {least:.0f} px or more"
     return ""
