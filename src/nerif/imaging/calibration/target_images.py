@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from nerif.common.conventions import InputError
-from nerif.imaging.calibration.target_identification import explain
+from nerif.imaging.calibration.target_diagnosis import explain
 from nerif.imaging.calibration.targets import CalibrationTarget, Detection, ViewImages
 from nerif.imaging.readers.exposure import full_scale
 from nerif.imaging.readers.frames import Frames, read_each

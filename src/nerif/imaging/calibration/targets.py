@@ -13,8 +13,16 @@ from nerif.common.conventions import InputError
 from nerif.common.settings import check_settings
 from nerif.imaging.calibration.dot_grid import dot_grid, find_dots
 
-__all__ = ["KINDS", "CalibrationTarget", "Detection", "ViewImages", "eight_bit", "marker_parameters",
-           "marker_squares", "saddle_points"]
+__all__ = [
+    "KINDS",
+    "CalibrationTarget",
+    "Detection",
+    "ViewImages",
+    "eight_bit",
+    "marker_parameters",
+    "marker_squares",
+    "saddle_points",
+]
 
 KINDS = ("chessboard", "charuco", "circles")
 DICTIONARY = "DICT_4X4_250"

@@ -1,7 +1,7 @@
 """Which target is in images where the one of the settings is not detected, or why none is.
 
 Tried in this order: ChArUco boards with the dictionaries of OpenCV, as they are and mirrored, chessboards of other
-numbers of squares, and grids of dots. A ChArUco board or chessboard is named only if it is then detected as such.
+numbers of squares, and grids of dots. A board is named if its markers lie where a board of that size has them.
 """
 
 from __future__ import annotations
@@ -10,13 +10,19 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import groupby
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from nerif.imaging.calibration.dot_grid import dot_grid, find_dots
-from nerif.imaging.calibration.targets import MAX_OFFSET, CalibrationTarget, eight_bit, marker_parameters, marker_squares
+from nerif.imaging.calibration.targets import (
+    MAX_OFFSET,
+    CalibrationTarget,
+    eight_bit,
+    marker_parameters,
+    marker_squares,
+)
 from nerif.imaging.readers.exposure import check_exposure
 
 __all__ = ["Identification", "explain", "identify"]
@@ -24,6 +30,8 @@ __all__ = ["Identification", "explain", "identify"]
 MIN_MARKERS = 6  # of a board
 MIN_SHARE = 0.75  # of the markers, in the layout of a board
 MIN_COUNT = 12  # squares between the corners of a chessboard, or dots: fewer are found in any texture
+MAX_SKEW = 0.1  # rms of the corners of markers, in squares; half of an edge is 0.2 to 0.45
+UPRIGHT = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])  # corners of a marker about its middle
 COUNTS = range(4, 41)  # of columns to try
 IDS = 250  # of a dictionary that are tried, or as many as the board has
 CANDIDATE_EDGE, CELL = 4.0, 2.0  # px: smallest square that could be a marker; least size of a cell to be read
@@ -56,14 +64,29 @@ class _Markers:
     Parameters
     ----------
     family : names of the dictionaries with the same first markers, from the smallest
-    centres : px
+    corners : px, of each marker clockwise from its upper left one
     size : height and width of the image, px
     """
 
     family: tuple[str, ...]
     ids: Int[np.ndarray, " n"]
-    centres: Float[np.ndarray, "n 2"]
+    corners: Float[np.ndarray, "n 4 2"]
     size: tuple[int, int]
+
+
+class _Layout(NamedTuple):
+    """The layout of a board.
+
+    rows : number up to the last marker
+    share : of the markers, that are in their squares
+    whole : another row would be in the image
+    """
+
+    columns: int
+    rows: int
+    legacy: bool
+    share: float
+    whole: bool
 
 
 def explain(images: Sequence[np.ndarray], target: CalibrationTarget, full: float, flip: str = "") -> str:
@@ -83,7 +106,9 @@ def explain(images: Sequence[np.ndarray], target: CalibrationTarget, full: float
     options = " ".join(_options(identification.target, target))
     parts = [f"the target is {identification.text}, not {_name(target)}: give {options}"] if options else []
     if identification.mirrored:
-        remedy = f'remove flip = "{flip}" from' if flip in ("horizontal", "vertical") else 'put flip = "horizontal" into'
+        remedy = (
+            f'remove flip = "{flip}" from' if flip in ("horizontal", "vertical") else 'put flip = "horizontal" into'
+        )
         parts.append(f"the images are mirrored: {remedy} views.toml")
     return "; ".join(parts) or _no_target(images, target, full)
 
@@ -125,7 +150,7 @@ def _charuco(images: Sequence[np.ndarray], target: CalibrationTarget) -> Identif
                 if len(markers.ids) < MIN_MARKERS:
                     continue
                 board = _board_of(markers, target)
-                if board is not None and board.detect(picture) is not None:
+                if board is not None:
                     return Identification(board, _name(board), mirrored)
                 elsewhere = elsewhere or markers
     if elsewhere is None or len(set(elsewhere.ids)) < len(elsewhere.ids) / 2:
@@ -176,52 +201,48 @@ def _markers(image: np.ndarray, target: CalibrationTarget) -> list[_Markers]:
     corners, ids, _, numbers = aruco.ArucoDetector(shortened, parameters).detectMarkersMultiDict(image)
     if ids is None or not len(ids):
         return []
-    centres = np.array([c.reshape(4, 2).mean(axis=0) for c in corners], dtype=np.float64)
+    corners = np.array(corners, dtype=np.float64).reshape(-1, 4, 2)
     ids, numbers = np.ravel(ids).astype(np.int64), np.ravel(numbers)
-    groups = [_Markers(f, ids[numbers == i], centres[numbers == i], image.shape) for i, f in enumerate(_families())]
+    groups = [_Markers(f, ids[numbers == i], corners[numbers == i], image.shape) for i, f in enumerate(_families())]
     return sorted((g for g in groups if len(g.ids)), key=lambda g: -len(g.ids))
 
 
 def _board_of(markers: _Markers, target: CalibrationTarget) -> CalibrationTarget | None:
-    """The board whose layout the markers have, or None; of several that fit, the one nearest the settings."""
+    """The board whose layout most of the markers have, or None; of several, the one nearest the settings."""
     even = target.legacy and target.rows % 2 == 0
     columns = dict.fromkeys([target.columns, target.rows, *COUNTS])
-    for count in columns:
-        for legacy in (even, not even):
-            layout = _rows_in_layout(markers, count, legacy)
-            if layout is None:
-                continue
-            rows, whole = layout
-            exchanged = {target.columns: target.rows, target.rows: target.columns}
-            rows = max(rows, 4, exchanged.get(count, rows if whole else target.rows))
-            rows += legacy and rows % 2  # an odd number has no legacy layout: the last row is not in the image
-            legacy = legacy if rows % 2 == 0 else target.legacy
-            return replace(
-                target, kind="charuco", columns=count, rows=rows, legacy=legacy,
-                dictionary=_smallest(markers.family, count * rows // 2, target.dictionary),
-            )  # fmt: skip
-    return None
+    layouts = [_layout(markers, count, legacy) for count in columns for legacy in (even, not even)]
+    best = max((layout for layout in layouts if layout), key=lambda layout: layout.share, default=None)
+    if best is None:
+        return None
+    expected = {target.columns: target.rows, target.rows: target.columns}  # also with columns and rows exchanged
+    rows = max(best.rows, 4, expected.get(best.columns, best.rows if best.whole else target.rows))
+    if best.legacy and rows % 2:  # an odd number has no legacy layout: the last row is not in the image
+        rows += 1
+    dictionary = _smallest(markers.family, best.columns * rows // 2, target.dictionary)
+    legacy = best.legacy if rows % 2 == 0 else target.legacy
+    return replace(target, kind="charuco", columns=best.columns, rows=rows, dictionary=dictionary, legacy=legacy)
 
 
-def _rows_in_layout(markers: _Markers, columns: int, legacy: bool) -> tuple[int, bool] | None:
-    """Number of rows up to the last marker, and whether another row would be in the image.
-
-    None if no homography maps the markers to their squares, or only a mirrored one.
-    """
+def _layout(markers: _Markers, columns: int, legacy: bool) -> _Layout | None:
+    """The layout with this number of columns if a homography maps markers to their squares, upright in them."""
     import cv2
 
     squares = marker_squares(columns, legacy, int(markers.ids.max()) + 1)[markers.ids].astype(np.float64)
     if len(np.unique(squares[:, 1])) < 2:
         return None
-    homography, fits = cv2.findHomography(markers.centres, squares, cv2.RANSAC, MAX_OFFSET)
+    homography, fits = cv2.findHomography(markers.corners.mean(axis=1), squares, cv2.RANSAC, MAX_OFFSET)
     if homography is None or fits.mean() < MIN_SHARE or fits.sum() < MIN_MARKERS:
         return None
-    if np.linalg.det(homography) * (homography[2] @ [*markers.centres.mean(axis=0), 1]) < 0:
+    corners = cv2.perspectiveTransform(markers.corners[fits.ravel() > 0], homography)
+    offsets = (corners - corners.mean(axis=1, keepdims=True)) * UPRIGHT
+    if np.std(offsets) > MAX_SKEW:  # rows of a grid of markers only, or a mirrored one
         return None
     rows = int(squares[fits.ravel() > 0, 1].max()) + 1
     below = np.stack([np.arange(columns), np.full(columns, rows)], axis=-1)[None].astype(np.float64)
     places = cv2.perspectiveTransform(below, np.linalg.inv(homography))[0]
-    return rows, bool(np.mean(((places > 0) & (places < markers.size[::-1])).all(axis=1)) > 0.5)
+    inside = ((places > 0) & (places < markers.size[::-1])).all(axis=1)
+    return _Layout(columns, rows, legacy, float(fits.mean()), float(inside.mean()) > 0.5)
 
 
 def _smallest(family: tuple[str, ...], count: int, preferred: str) -> str:
@@ -339,7 +360,9 @@ def _no_target(images: Sequence[np.ndarray], target: CalibrationTarget, full: fl
         if best is None or len(best.ids) < MIN_MARKERS:
             text = "no marker of any dictionary of OpenCV was detected, no chessboard, no grid of dots"
         else:
-            text = f"at most {len(best.ids)} markers of {best.family[-1]} were detected in an image, too few for a board"
+            text = (
+                f"at most {len(best.ids)} markers of {best.family[-1]} were detected in an image, too few for a board"
+            )
     elif target.kind == "circles":
         count = target.columns * target.rows
         dots = max(len(find_dots(p, count)[0]) for picture in pictures for p in (picture, 255 - picture))
