@@ -231,3 +231,15 @@ def test_a_view_is_explained_once(tmp_path):
         "note: view 'cam1': no charuco of 9 x 7 found in 4 of 4 background images; the images are mirrored: "
         'put flip = "horizontal" into views.toml'
     )
+
+
+def test_an_error_for_few_detections_says_why(tmp_path):
+    folder = tmp_path / "cam1" / "target"
+    folder.mkdir(parents=True)
+    others = photographs(charuco(9, 7, "DICT_5X5_50"), count=9)
+    for i, image in enumerate([*photographs(charuco(9, 7, BOARD.dictionary), count=1), *others]):
+        tifffile.imwrite(folder / f"{i}.tif", image)
+    with refused("view 'cam1'") as error:
+        calibrate_views(find_views(tmp_path), BOARD)
+    assert "got 1; no charuco of 9 x 7 found in 9 of 10 target images" in str(error.value)
+    assert "give --target.dictionary DICT_5X5_50" in str(error.value)

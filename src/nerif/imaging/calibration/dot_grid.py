@@ -48,10 +48,10 @@ def find_dots(image: np.ndarray, count: int) -> tuple[Float[np.ndarray, "n 2"], 
     """
     import cv2
 
-    parameters = cv2.SimpleBlobDetector_Params()
+    parameters = cv2.SimpleBlobDetector.Params()
     parameters.maxArea = image.size / count
     parameters.collectContours = True
-    detector = cv2.SimpleBlobDetector_create(parameters)
+    detector = cv2.SimpleBlobDetector.create(parameters)
     dots = detector.detect(image)
     if dots and np.median([_fill(contour) for contour in detector.getBlobContours()]) > MAX_FILL:
         dots = []  # squares of a chessboard, or markers
@@ -94,7 +94,7 @@ def _grow(
     second = vectors[int(np.argmax(sines > MIN_SINE))]
     if first[0] * second[1] < first[1] * second[0]:
         second = -second
-    places, taken = {(0, 0): seed}, {seed}
+    places, taken_dots = {(0, 0): seed}, {seed}
     front = [((0, 0), np.stack([first, second]))]
     while front:
         (column, row), steps = front.pop(0)
@@ -106,14 +106,14 @@ def _grow(
             reach = MAX_OFFSET * float(np.linalg.norm(steps[axis]))
             _, there = tree.query(centres[here] + sign * steps[axis], distance_upper_bound=reach)
             there = int(there)
-            if there == len(centres) or there in taken:
+            if there == len(centres) or there in taken_dots:
                 continue
             if not 1 / MAX_RATIO < diameters[there] / diameters[here] < MAX_RATIO:
                 continue
             beside = steps.copy()
             beside[axis] = sign * (centres[there] - centres[here])
             places[place] = there
-            taken.add(there)
+            taken_dots.add(there)
             front.append((place, beside))
     return places
 

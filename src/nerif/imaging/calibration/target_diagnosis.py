@@ -201,9 +201,9 @@ def _markers(image: np.ndarray, target: CalibrationTarget) -> list[_Markers]:
     corners, ids, _, numbers = aruco.ArucoDetector(shortened, parameters).detectMarkersMultiDict(image)
     if ids is None or not len(ids):
         return []
-    corners = np.array(corners, dtype=np.float64).reshape(-1, 4, 2)
+    places = np.array(corners, dtype=np.float64).reshape(-1, 4, 2)
     ids, numbers = np.ravel(ids).astype(np.int64), np.ravel(numbers)
-    groups = [_Markers(f, ids[numbers == i], corners[numbers == i], image.shape) for i, f in enumerate(_families())]
+    groups = [_Markers(f, ids[numbers == i], places[numbers == i], image.shape) for i, f in enumerate(_families())]
     return sorted((g for g in groups if len(g.ids)), key=lambda g: -len(g.ids))
 
 
@@ -344,8 +344,8 @@ def _circles(images: Sequence[np.ndarray], target: CalibrationTarget) -> Identif
                 )
             rows, columns = grid.centres.shape[:2]
             numbers = sorted((columns, rows), reverse=target.columns >= target.rows)
-            found = replace(target, kind="circles", columns=numbers[0], rows=numbers[1])
-            return Identification(found, _name(found))
+            regular = replace(target, kind="circles", columns=numbers[0], rows=numbers[1])
+            return Identification(regular, _name(regular))
     return None
 
 

@@ -39,7 +39,7 @@ def find_targets(
     on_background : the target on the background, if it differs (a larger print)
     """
     detections: dict[str, dict[str, Detection]] = {"target": {}, "background": {}}
-    size = (0, 0)
+    size, diagnosis = (0, 0), ""
     view.open("target")  # the background may be left out, the target may not
     for source in ("target", "background"):
         if source not in view.sources:
@@ -76,10 +76,12 @@ def find_targets(
             f"no {board.kind} of {board.columns} x {board.rows} found in {len(missing)} of {count} {source} images; "
             + explain_missing(view, source, board, missing)
         )
-        if source == "target" and not detections[source]:
-            raise InputError(text, field=f"view '{view.name}'")
+        if source == "target":
+            if not detections[source]:
+                raise InputError(text, field=f"view '{view.name}'")
+            diagnosis = text
         say(f"note: view '{view.name}': {text}")
-    return ViewImages(view.name, size, detections["target"], detections["background"])
+    return ViewImages(view.name, size, detections["target"], detections["background"], diagnosis)
 
 
 def few_detections(count: int, total: int) -> bool:

@@ -61,12 +61,14 @@ class ViewImages:
     size : (height, width) of its images, px
     poses : the target free in space, by the name of the pose, which cameras share
     background : the target on the background, by the name of the image
+    diagnosis : why few images of the target have a detection; empty if many have
     """
 
     name: str
     size: tuple[int, int]
     poses: Mapping[str, Detection]
     background: Mapping[str, Detection]
+    diagnosis: str = ""
 
     def without(self, names: Collection[str]) -> ViewImages:
         """Return the detections except those in images of these names, such as cam1/target/7."""
