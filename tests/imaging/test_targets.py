@@ -64,6 +64,41 @@ def test_a_rotated_target_keeps_its_numbers(camera, kind, turn):
     assert np.abs(errors(target, *imaged(target, camera, (10, 5, turn)))).max() < 0.2
 
 
+@pytest.mark.parametrize("kind", TARGETS)
+def test_white_on_black(camera, kind):
+    target = TARGETS[kind]
+    image, truth = imaged(target, camera, (20, -15, 5))
+    black = image.max() - image
+    # a chessboard of an odd and an even number of squares is its own negative turned by 180 degrees
+    truth = truth[::-1] if kind == "chessboard" else truth
+    assert np.sqrt(np.mean(errors(target, black, truth) ** 2)) < 0.03
+    assert [target.detect(i).negative for i in (image, black)] == [False, kind != "chessboard"]
+
+
+@pytest.mark.parametrize(("kind", "columns", "rows"), [("circles", 8, 6), ("circles", 9, 5), ("charuco", 9, 6)])
+def test_a_part_of_a_larger_target_is_not_detected(camera, kind, columns, rows):
+    image, _ = imaged(TARGETS[kind], camera, (10, 5, 3))
+    assert CalibrationTarget(kind, columns, rows, pitch=7.0).detect(image) is None
+
+
+@pytest.mark.parametrize("turn", [-60, 80])
+def test_a_turned_grid_of_dots_keeps_its_numbers(camera, turn):
+    target = CalibrationTarget("circles", 7, 6, pitch=6.0)
+    assert np.abs(errors(target, *imaged(target, camera, (10, 5, turn)))).max() < 0.2
+
+
+def test_dots_and_markers_of_any_size_in_a_large_image():
+    for target, step in ((CalibrationTarget("circles", 9, 6), 270), (CalibrationTarget("charuco", 9, 6), 40)):
+        print_ = (20 + 200 * target.raster(target.pitch / step)).astype(np.uint8)
+        image = np.full((2000, 3000), 120, np.uint8)
+        image[: print_.shape[0], : print_.shape[1]] = print_
+        detection = target.detect(image)
+        assert detection is not None
+        scale = step / target.pitch
+        shift = detection.pixels - scale * detection.points[:, :2]
+        assert np.abs(shift - shift.mean(axis=0)).max() < 0.2
+
+
 @pytest.mark.parametrize("bits", [8, 16])
 def test_any_bit_depth(camera, bits):
     target = TARGETS["chessboard"]

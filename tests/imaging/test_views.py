@@ -198,13 +198,15 @@ def test_poses_are_named_by_numbers_in_names(tmp_path, files, expected):
 
 def test_images_without_a_target_are_reported(folder, lines):
     rng = np.random.default_rng(1)
-    for i in range(2):
-        save(folder / "cam2" / "target" / f"t{i}.tif", rng.integers(0, 4000, (120, 160)).astype(np.uint16))
-    calls: list[int] = []
     target = CalibrationTarget("charuco", 8, 6, 5.0)
+    board = (4000 * np.pad(target.raster(0.25), 20, constant_values=0.5)).astype(np.uint16)
+    for i in range(3):
+        image = rng.integers(0, 4000, board.shape).astype(np.uint16) if i else board
+        save(folder / "cam2" / "target" / f"t{i}.tif", image)
+    calls: list[int] = []
     images = find_targets(find_views(folder)[0], target, lines.append, lambda: calls.append(1))
-    assert (images.poses, images.size, len(calls)) == ({}, (120, 160), 2)
-    assert sum("no charuco of 8 x 6 found" in line for line in lines) == 2
+    assert (list(images.poses), images.size, len(calls)) == (["0"], board.shape, 3)
+    assert [f"t{i}.tif: no charuco of 8 x 6 found" in line for i, line in enumerate(lines, 1)] == [True, True]
 
 
 def test_capital_letters_of_folders_endings_and_the_list_of_views(folder):

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import os
 from collections import OrderedDict
+from collections.abc import Sequence
 from pathlib import Path
 from threading import Lock
 from typing import Any
 
 from nerif.app.project import Project
 from nerif.common.conventions import InputError
+from nerif.imaging.calibration.target_images import explain_missing
 from nerif.imaging.calibration.targets import CalibrationTarget, Detection
 from nerif.imaging.image_quality import ImageQuality, image_quality, jpeg_address
 from nerif.imaging.readers.crop import Crop
@@ -68,6 +70,11 @@ class ImageFiles:
             return target.detect(view.cropped(frames[number], frames.name(number)))
 
         return self._from_cache(view, source, ("detection", number, target), read)
+
+    def explanation(self, view: View, source: str, numbers: Sequence[int], target: CalibrationTarget) -> str:
+        """Return why a target is not detected in the images with these numbers."""
+        what = ("explanation", tuple(numbers), target)
+        return self._from_cache(view, source, what, lambda: explain_missing(view, source, target, numbers))
 
     def _from_cache(self, view: View, source: str, what: tuple[Any, ...], read: Any) -> Any:
         key = str(Path(view.folder)), view.name, view.sources.get(source), source, view.crop, view.mosaic, what

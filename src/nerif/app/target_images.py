@@ -11,7 +11,7 @@ from nerif.app.elements import text_html
 from nerif.app.workspace import Workspace
 from nerif.common.conventions import InputError
 from nerif.imaging.calibration.result import ImageError
-from nerif.imaging.calibration.target_images import pose_names
+from nerif.imaging.calibration.target_images import few_detections, pose_names
 from nerif.imaging.calibration.targets import CalibrationTarget, Detection
 from nerif.imaging.readers.views import View
 
@@ -66,7 +66,8 @@ class TargetImages:
                 return
             with self._place, ui.element("div"):
                 text_html(title, "h3")
-                grid = ui.element("div").classes("targets")
+                note, grid = ui.element("div"), ui.element("div").classes("targets")
+            missing = []
             for number, pose in enumerate(names):
                 name = f"{view.name}/{source}/{pose}"
                 try:
@@ -79,8 +80,16 @@ class TargetImages:
                     continue
                 if request != self._request:
                     return
+                if detection is None:
+                    missing.append(number)
                 with grid:
                     self._cell(name, address, detection, shape, errors, name in exclusions)
+            if missing and few_detections(len(names) - len(missing), len(names)):
+                text = await self.work.in_thread(self.files.explanation, view, source, missing, targets[source])
+                if request != self._request:
+                    return
+                with note:
+                    text_html(f"No {targets[source].label} found: {text}.", classes="note")
 
     def _shape(self, view: View, source: str) -> tuple[int, int]:
         shape = view.open(source).shape

@@ -109,7 +109,7 @@ def _check_count(view: ViewImages, images: int) -> None:
     if images < MIN_IMAGES:
         raise InputError(
             f"expected the target in at least {MIN_IMAGES} images (better 10 or more, tilted in different ways), "
-            f"got {images}",
+            f"got {images}{view.diagnosis and '; '}{view.diagnosis}",
             field=f"view '{view.name}'",
         )
 

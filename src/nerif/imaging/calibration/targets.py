@@ -13,12 +13,23 @@ from nerif.common.conventions import InputError
 from nerif.common.settings import check_settings
 from nerif.imaging.calibration.dot_grid import dot_grid, find_dots
 
-__all__ = ["KINDS", "CalibrationTarget", "Detection", "ViewImages", "eight_bit", "marker_parameters", "saddle_points"]
+__all__ = [
+    "KINDS",
+    "CalibrationTarget",
+    "Detection",
+    "ViewImages",
+    "eight_bit",
+    "marker_parameters",
+    "marker_squares",
+    "saddle_points",
+]
 
 KINDS = ("chessboard", "charuco", "circles")
 DICTIONARY = "DICT_4X4_250"
 MARKER = 0.6  # edge of a marker over that of a square
 MIN_POINTS = 6  # of a detection
+MIN_BEYOND = 2  # markers by which a ChArUco board is larger than in the settings
+MAX_OFFSET = 0.25  # of a marker from its square, in squares
 MIN_EDGE = 8.0  # of a marker, px
 TURN = np.radians(20.0)  # of a grid of dots in the image, least ambiguous
 
@@ -50,12 +61,14 @@ class ViewImages:
     size : (height, width) of its images, px
     poses : the target free in space, by the name of the pose, which cameras share
     background : the target on the background, by the name of the image
+    diagnosis : why few images of the target have a detection; empty if many have
     """
 
     name: str
     size: tuple[int, int]
     poses: Mapping[str, Detection]
     background: Mapping[str, Detection]
+    diagnosis: str = ""
 
     def without(self, names: Collection[str]) -> ViewImages:
         """Return the detections except those in images of these names, such as cam1/target/7."""
@@ -195,11 +208,30 @@ class CalibrationTarget:
         import cv2
 
         detector = cv2.aruco.CharucoDetector(self._board(), detectorParams=marker_parameters(image))
-        corners, ids, _, _ = detector.detectBoard(image)
+        corners, ids, markers, numbers = detector.detectBoard(image)
         if ids is None or len(ids) < MIN_POINTS:
             return None
+        ids, pixels = ids.ravel().astype(np.int64), corners.reshape(-1, 2).astype(np.float64)
+        centres = np.array([marker.reshape(4, 2).mean(axis=0) for marker in markers])
+        if self._continues(ids, pixels, numbers.ravel(), centres):
+            return None
         gap = (1 - (self.marker or MARKER * self.pitch) / self.pitch) / 2
-        return self._refined(image, ids.ravel().astype(np.int64), corners.reshape(-1, 2).astype(np.float64), gap)
+        return self._refined(image, ids, pixels, gap)
+
+    def _continues(self, ids: np.ndarray, pixels: np.ndarray, numbers: np.ndarray, centres: np.ndarray) -> bool:
+        """Whether markers below the last row continue the board, which then has another middle."""
+        import cv2
+
+        beyond = numbers >= self.columns * self.rows // 2
+        if beyond.sum() < MIN_BEYOND:
+            return False
+        squares = marker_squares(self.columns, self.legacy and self.rows % 2 == 0, int(numbers.max()) + 1)
+        to_pitches, _ = cv2.findHomography(pixels, self.points[ids, :2] / self.pitch)
+        if to_pitches is None:
+            return False
+        places = cv2.perspectiveTransform(centres[None].astype(np.float64), to_pitches)[0]
+        offsets = places - (squares[numbers] - [(self.columns - 1) / 2, (self.rows - 1) / 2])
+        return int((np.linalg.norm(offsets[beyond], axis=1) < MAX_OFFSET).sum()) >= MIN_BEYOND
 
     def _refined(self, image: np.ndarray, ids: np.ndarray, pixels: np.ndarray, room: float) -> Detection | None:
         """Corners at their saddle points, `room` pitches from other edges; None if too few are left."""
@@ -231,6 +263,18 @@ def marker_parameters(image: np.ndarray, edge: float = MIN_EDGE) -> Any:
     parameters = cv2.aruco.DetectorParameters()
     parameters.minMarkerPerimeterRate = min(parameters.minMarkerPerimeterRate, 4 * edge / max(image.shape))
     return parameters
+
+
+def marker_squares(columns: int, legacy: bool, count: int) -> Int[np.ndarray, "count 2"]:
+    """Return column and row of the squares with the first `count` markers of a ChArUco board.
+
+    Parameters
+    ----------
+    legacy : the layout of OpenCV before version 4.6 of an even number of rows; with an odd number it was the same
+    """
+    row, column = np.divmod(np.arange(2 * count + columns), columns)
+    with_marker = (row + column) % 2 == (0 if legacy else 1)
+    return np.stack([column, row], axis=-1)[with_marker][:count]
 
 
 def eight_bit(image: np.ndarray) -> np.ndarray:
