@@ -48,8 +48,10 @@ INSTANTS, MIN_INSTANTS = 8, 3  # that are predicted
 REACH, MAX_REACH = 5, 40  # frames, of the shifts that are tried: at first, and where none of these fits
 CANDIDATES = 10  # places of the film of which the one with the largest change is used
 VOXELS = 16  # of the predictions, along the longest edge: the bands that other views predict are coarse
-MIN_GAIN, MIN_GAIN_AFTER = 25.0, 5.0  # of evidence, for the first shift and for those after it; noise gains 18 at most
-MAX_ROUNDS = 12
+MIN_GAIN = 25.0  # of evidence, for a shift; noise gains 18 at most
+MIN_GAIN_AFTER = 5.0  # of a shift after the first one
+MAX_ROUNDS, MAX_TRIALS = 12, 3  # shifts of one view; views that are tried
+MIN_SHARE = 0.4  # of the gain of a view that is tried in the largest one
 FITS_NOWHERE = 0.5  # evidence of a view over the median, below which more shifts are tried
 OCTAVES = (1, 2, 4, 8, 16, 32)  # first frequencies of the bands but the lowest, in half periods
 MIN_COUNT, MAX_CORRELATION = 8, 0.999  # of a band
@@ -243,7 +245,9 @@ def frame_shifts(
     excerpt: Excerpt, instants: range, voxels: int = VOXELS,
     on_step: Callable[[int, int], None] = lambda done, total: None,
 ) -> tuple[Shift, ...]:  # fmt: skip
-    """Shift the film of one view after the other while its evidence gains.
+    """Shift the film of one view after the other, while its evidence and that of all views together gain.
+
+    A late film also moves the best shifts of its neighbours, so the views with the largest gains are tried.
 
     Parameters
     ----------
@@ -255,16 +259,27 @@ def frame_shifts(
     shifts = [0] * count
     evidences = _evidences(excerpt, instants, shifts, voxels, on_step)
     for _ in range(MAX_ROUNDS):
-        view = max(range(count), key=lambda i: evidences[i].gain())
-        if evidences[view].gain() < (MIN_GAIN_AFTER if any(shifts) else MIN_GAIN):
+        gains = [evidence.gain() for evidence in evidences]
+        if max(gains) < (MIN_GAIN_AFTER if any(shifts) else MIN_GAIN):
             break
-        shifts[view] += evidences[view].best
-        evidences = _evidences(excerpt, instants, shifts, voxels, on_step)
+        trials, likely = [], [i for i in range(count) if gains[i] >= MIN_SHARE * max(gains)]
+        for view in sorted(likely, key=lambda i: -gains[i])[:MAX_TRIALS]:
+            trial = [shift + (i == view) * evidences[view].best for i, shift in enumerate(shifts)]
+            trials.append((trial, _evidences(excerpt, instants, trial, voxels, on_step)))
+        best = max(trials, key=lambda trial: _total(trial[1]))
+        if _total(best[1]) <= _total(evidences):
+            break
+        shifts, evidences = best
     (usual, _), *_ = Counter(shifts).most_common(1)  # most films are synchronous
     return tuple(
         Shift(name, frames := shift - usual, e.by_shift[0] - e.by_shift.get(-frames, 0.0), e.sharp)
         for name, shift, e in zip(excerpt.names, shifts, evidences, strict=True)
     )
+
+
+def _total(evidences: Sequence[Evidence]) -> float:
+    """The evidence of all views without further shifts."""
+    return sum(evidence.by_shift[0] for evidence in evidences)
 
 
 def late_views(shifts: Sequence[Shift], frame_offsets: Mapping[str, int]) -> list[Finding]:
