@@ -87,19 +87,19 @@ def _earlier(case: Case, measurement: Measurement, states: list[State]) -> Itera
     """Yield the reconstruction of each state: resumed, and stopped before the next step."""
     assert isinstance(case.reconstructor, NeRIF)
     for state in states:
-        step = int(state.scalars["budget"]["step"])
+        step = int(state.scalars["schedule"]["step"])
         stop = replace(case.reconstructor, time_limit=0.0, max_steps=step, compile="off")
         yield stop(measurement, resume=state)
 
 
 def _point(result: Reconstruction, truth: Volume, rays: int) -> dict[str, float]:
     assert result.state is not None
-    budget = result.state.scalars["budget"]
+    schedule = result.state.scalars["schedule"]
     values = result.field.sample(truth.grid, result.device).numpy()
     return {
-        "step": float(budget["step"]),
-        "epoch": budget["rays_done"] / rays,
-        "seconds": float(budget["seconds"]),
+        "step": float(schedule["step"]),
+        "epoch": schedule["rays_done"] / rays,
+        "seconds": float(schedule["seconds"]),
         "loss": result.history[-1].get("loss", float("nan")),
         **volume_errors(truth.values.numpy(), values, N_AMBIENT),
     }

@@ -41,7 +41,9 @@ def rising(instant: float) -> VoxelField:
     """Uneven hot balls that rise by 3 mm a frame and drift."""
     grid, rng, speed = Grid.of_resolution(BOX, 28), np.random.default_rng(1), 3.0
     points, excess = grid.points().numpy(), 0
-    for x, y, start, size in zip(*rng.uniform(-9, 9, (2, 18)), np.linspace(-130, 15, 18), rng.uniform(3, 5, 18), strict=True):
+    for x, y, start, size in zip(
+        *rng.uniform(-9, 9, (2, 18)), np.linspace(-130, 15, 18), rng.uniform(3, 5, 18), strict=True
+    ):
         centre = np.array([x + 0.6 * instant, y, start + speed * instant])
         excess = excess - 1e-4 * np.exp(-np.square((points - centre) / size).sum(axis=-1) / 2)
     return VoxelField.through(torch.as_tensor(excess, dtype=torch.float32).reshape(grid.shape), grid)
@@ -133,7 +135,9 @@ def test_the_remedy_adds_to_the_offsets_of_the_measurement():
     shifts += [Shift("e", 2, 20, False), Shift("f", 0, 0, True)]
     (finding,) = late_views(shifts, {"b": 3})
     assert finding.views == ("b", "c")
-    assert str(finding).startswith("views b and c: their films are 1 frame early (gain of evidence 90, 60; 25 is clear)")
+    assert str(finding).startswith(
+        "views b and c: their films are 1 frame early (gain of evidence 90, 60; 25 is clear)"
+    )
     assert str(finding).endswith("nerif displacement --frame-offset b 2 --frame-offset c -1")
     assert late_views([Shift("a", 0, 0, True), Shift("b", 1, 10, False)], {}) == []
 

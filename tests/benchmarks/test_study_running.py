@@ -74,7 +74,7 @@ def test_another_rig_is_another_measurement(field):
     changed = {
         "views": 5, "arc": (5.0, 170.0), "extra_angles": (33.0,), "elevation": 3.0, "focal_length": 40.0,
         "pixel_pitch": 0.3, "image_size": (16, 20), "distance": 600.0, "background_distance": 400.0,
-        "projection": "telecentric", "magnification": 0.3,
+        "projection": "telecentric", "magnification": 0.3, "sensor_tilt": (3.0, 0.0),
     }  # fmt: skip
     also = {"projection": "telecentric"} if field == "magnification" else {}
     other = replace(case, ring=replace(RING, **also, **{field: changed[field]}))

@@ -101,7 +101,7 @@ def test_losses_are_shares_of_the_visible_background(tmp_path):
         tmp_path / A / "region.tif", np.where(np.arange(130) < 90, 0, 255).astype(np.uint8) * np.ones(SHAPE, np.uint8)
     )
     (view, *_) = find_views(tmp_path)
-    _, result, _ = ViewReference.of(recorded, view).measure([0])
+    result = ViewReference.of(recorded, view).measure([0]).result
     assert sum(result.losses.values()) == pytest.approx(1 - result.valid[:, 90:].mean())
     assert sum(result.losses.values()) < 0.6  # of all pixels more are lost
 

@@ -160,7 +160,7 @@ def test_notes_about_files_are_reported_once_per_source(folder, lines, monkeypat
     view = find_views(folder)[0]
     good_images(view, "reference", lines.append)
     assert lines == ["note: cam2/reference/r0.tif: a time stamp in its first pixels"]
-    assert lines == [f"note: {note}" for note in image_quality(view, "reference").notes]
+    assert lines[0] == f"note: {image_quality(view, 'reference').notes[0]}"
     assert len(open_frames(f"{folder}/cam2/reference[1:]").notes) == 1
 
 

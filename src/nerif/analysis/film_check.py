@@ -45,14 +45,13 @@ from nerif.reconstruction.device import on_free_cores
 __all__ = ["Evidence", "Excerpt", "Shift", "band_evidence", "check_film", "frame_shifts", "late_views"]
 
 INSTANTS, MIN_INSTANTS = 8, 3  # that are predicted
-REACH, MAX_REACH = 5, 40  # frames, of the shifts that are tried: at first, and where none of these fits
+REACH, MAX_REACH = 5, 40  # frames, of the shifts that are tried: at first, and where none of these stands out
 CANDIDATES = 10  # places of the film of which the one with the largest change is used
 VOXELS = 16  # of the predictions, along the longest edge: the bands that other views predict are coarse
 MIN_GAIN = 25.0  # of evidence, for a shift; noise gains 18 at most
 MIN_GAIN_AFTER = 5.0  # of a shift after the first one
 MAX_ROUNDS, MAX_TRIALS = 12, 3  # shifts of one view; views that are tried
 MIN_SHARE = 0.4  # of the gain of a view that is tried in the largest one
-FITS_NOWHERE = 0.5  # evidence of a view over the median, below which more shifts are tried
 OCTAVES = (1, 2, 4, 8, 16, 32)  # first frequencies of the bands but the lowest, in half periods
 MIN_COUNT, MAX_CORRELATION = 8, 0.999  # of a band
 
@@ -169,6 +168,12 @@ class Evidence:
         return self.by_shift[self.best] - self.by_shift.get(over, 0.0)
 
     @property
+    def stands_out(self) -> bool:
+        """Whether one shift has clearly more evidence than all others."""
+        first, second = sorted((*self.by_shift.values(), 0.0), reverse=True)[:2]
+        return first - second > MIN_GAIN
+
+    @property
     def sharp(self) -> bool:
         """Whether the evidence for no shift clearly exceeds that for any other."""
         others = [value for k, value in self.by_shift.items() if k]
@@ -188,12 +193,9 @@ def _evidences(
             on_step(sum(map(len, predictions.values())), len(views) * len(instants))
     films = [torch.stack(predictions[i]).numpy() for i in views]
     results = [Evidence(_of_shifts(excerpt, instants, i, shifts[i], films[i], range(-REACH, REACH + 1))) for i in views]
-    usual = float(np.median([r.by_shift[r.best] for r in results]))
     for i in views:
         reach = REACH
-        while reach < MAX_REACH and (
-            abs(results[i].best) == reach or results[i].by_shift[results[i].best] < FITS_NOWHERE * usual
-        ):
+        while reach < MAX_REACH and (abs(results[i].best) == reach or not results[i].stands_out):
             further = [k for k in range(-2 * reach, 2 * reach + 1) if abs(k) > reach]
             more = _of_shifts(excerpt, instants, i, shifts[i], films[i], further)
             results[i], reach = Evidence({**results[i].by_shift, **more}), 2 * reach

@@ -20,9 +20,7 @@ FINE = 1.0  # px, standard deviation of the mean that follows binning: finer str
 EVEN = 0.5  # of the median variance is added to the local one, so that parts without a pattern stay weak
 CLIP = 4.0  # standard deviations; an edge or a reflection does not outweigh the pattern
 TILE = 16  # px
-MIN_PIXELS = (
-    10_000  # of an image; smaller ones of one scene, half hidden and noisy, may not correlate by more than chance
-)
+MIN_PIXELS = 10_000  # of an image; in smaller ones, half hidden and noisy, one scene correlates no more than chance
 HIGH = 0.3  # correlation that no two scenes have
 SIGNIFICANT = 8.0  # standard deviations over all shifts; the highest peak of two scenes has five
 

@@ -28,7 +28,7 @@ def find_targets(
     on_image: Callable[[], None] = lambda: None,
     on_background: CalibrationTarget | None = None,
 ) -> ViewImages:
-    """Detect the target in all images of a view, and report the images without a detection.
+    """Detect the target in all images of a view; report how these are read, and those without a detection.
 
     Where few images have one, it is said why. InputError if none of those in free space has.
 
@@ -46,6 +46,8 @@ def find_targets(
             continue
         frames = view.open(source)
         names = pose_names(frames)
+        for note in view.notes(source):
+            say(f"note: {note}")
         board = on_background or target if source == "background" else target
         missing, negative = [], False
         for i, image in read_each(frames, range(len(frames))):
