@@ -223,3 +223,15 @@ def test_other_files_of_numpy_are_refused(tmp_path):
     path.write_bytes(b"PK broken")
     with refused(path):
         import_cameras(path)
+
+
+def test_a_tilted_sensor_is_part_of_the_steps_of_astra():
+    tilted = [replace(c, tilt=torch.tensor([0.12, -0.08], dtype=F64)) for c in rig(skew=3.0)]
+    rows = astra_of(tilted, SIZE, GRID)["Vectors"]
+    for camera, row in zip(tilted, rows, strict=True):
+        pixels = astra_pixels("cone_vec", row, SIZE, POINTS.numpy())
+        np.testing.assert_allclose(pixels, camera.project(POINTS).numpy(), atol=1e-8)
+        upright, _ = camera_of("cone_vec", torch.from_numpy(row), SIZE, "upright")  # the same rays without a tilt
+        np.testing.assert_allclose(upright.project(POINTS).numpy(), pixels, atol=1e-8)
+    with refused("view 'cam0'"):
+        tigre_of([replace(c, intrinsics=rig()[0].intrinsics) for c in tilted], SIZE, GRID)

@@ -5,11 +5,12 @@ detector, and its steps u from column to column and v from row to row. A pixel l
 
     d + (column - (columns - 1)/2) u + (row - (rows - 1)/2) v
 
-Its ray runs from the source, or along the direction, through that point. With M = R^T K^-1 and a perspective camera,
+Its ray runs from the source, or along the direction, through that point. With M = R^T E K^-1 and a perspective camera,
 
     u = D M e_1,    v = D M e_2,    d = source + D M ((columns - 1)/2, (rows - 1)/2, 1),    D: depth of the detector
 
-for any D > 0; the inverse is the QR decomposition of M. Skew of K is part of u and v; distortion and lenses are not.
+for any D > 0; E holds the axes of a tilted sensor (distortion.py). The inverse is the QR decomposition of M, a camera
+without tilt. Skew of K is part of u and v; distortion and lenses are not.
 
 Arrays in ASTRA: projections (row, view, column), volumes (z, y, x). Lengths are mm.
 
@@ -28,6 +29,7 @@ from torch import Tensor
 
 from nerif.common.conventions import InputError, whole
 from nerif.geometry.camera import PERSPECTIVE, TELECENTRIC, Camera, Projection
+from nerif.geometry.distortion import sensor_axes
 from nerif.geometry.grid import Box, Grid
 
 __all__ = [
@@ -85,7 +87,7 @@ def depth_behind(camera: Camera, box: Box) -> float:
 
 def vectors_of(camera: Camera, size: tuple[int, int], depth: float) -> Float[Tensor, 12]:
     """Return the row of a camera, of a detector with rows and columns `size` at a depth in mm."""
-    m = camera.rotation.T @ torch.linalg.inv(camera.intrinsics)
+    m = camera.rotation.T @ sensor_axes(camera.tilt) @ torch.linalg.inv(camera.intrinsics)
     middle = m @ _middle(size)
     if camera.projection.shows_depth:
         return torch.cat([camera.centre, camera.centre + depth * middle, depth * m[:, 0], depth * m[:, 1]])

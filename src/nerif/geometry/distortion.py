@@ -28,7 +28,8 @@ from torch import Tensor
 from nerif.common.conventions import Pixels
 
 __all__ = [
-    "POWERS", "UPRIGHT", "Array", "distort", "fold", "from_sensor", "tilt", "tilt_slopes", "to_sensor", "undistort",
+    "POWERS", "UPRIGHT", "Array", "distort", "fold", "from_sensor", "sensor_axes", "tilt", "tilt_slopes", "to_sensor",
+    "undistort",
 ]  # fmt: skip
 
 POWERS = (2, 4, 1, 1, 6)
@@ -62,11 +63,22 @@ def to_sensor(
 def from_sensor(points: Pixels, coefficients: Float[Tensor, 5], angles: Float[Tensor, 2]) -> Pixels:
     """Return the image (x, y) of points of the sensor; NaN if there is none."""
     if bool(angles.any()):
-        (a, b), (x, y) = angles.tolist(), points.unbind(-1)
-        depth = 1 - math.cos(a) * math.sin(b) * x + math.sin(a) * y
-        across = torch.stack([math.cos(b) * x, math.sin(a) * math.sin(b) * x + math.cos(a) * y], dim=-1)
-        points = (across / depth[..., None]).masked_fill(depth[..., None] <= 0, torch.nan)
+        x, y, depth = (torch.cat([points, torch.ones_like(points[..., :1])], dim=-1) @ sensor_axes(angles).T).unbind(-1)
+        points = (torch.stack([x, y], dim=-1) / depth[..., None]).masked_fill(depth[..., None] <= 0, torch.nan)
     return undistort(points, coefficients)
+
+
+def sensor_axes(angles: Float[Tensor, 2]) -> Float[Tensor, "3 3"]:
+    """Return the matrix E with the columns e_x, e_y, e_z: the line of sight of (x_t, y_t) is along E (x_t, y_t, 1)."""
+    a, b = angles.tolist()
+    return torch.tensor(
+        [
+            [math.cos(b), 0.0, 0.0],
+            [math.sin(a) * math.sin(b), math.cos(a), 0.0],
+            [-math.cos(a) * math.sin(b), math.sin(a), 1.0],
+        ],
+        dtype=torch.float64,
+    )
 
 
 def tilt(x: Array, y: Array, angles: Iterable[Any]) -> tuple[Array, Array, tuple[Array, Array, Array, Array]]:

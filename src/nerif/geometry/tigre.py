@@ -49,10 +49,10 @@ def tigre_of(
     """
     check_vectors(cameras)
     for camera in cameras:
-        if camera.projection != PERSPECTIVE or float(camera.intrinsics[0, 1]) != 0:
-            got = "skew" if camera.projection == PERSPECTIVE else camera.projection.name
+        if camera.projection != PERSPECTIVE or float(camera.intrinsics[0, 1]) != 0 or bool(camera.tilt.any()):
+            got = "skew or tilt" if camera.projection == PERSPECTIVE else camera.projection.name
             raise InputError(
-                f"expected perspective cameras without skew, got {got}; ASTRA has a geometry for them",
+                f"expected perspective cameras without skew and tilt, got {got}; ASTRA has a geometry for them",
                 field=f"view '{camera.name}'",
             )
     origin = torch.tensor(grid.box.centre, dtype=torch.float64)

@@ -9,10 +9,11 @@ import numpy as np
 from jaxtyping import Complex, Float, Shaped
 
 from nerif.common.conventions import InputError
+from nerif.imaging.displacement.displacement import remove_shake
 from nerif.imaging.readers.frames import as_float
 from nerif.imaging.readers.views import View, read_sample
 
-__all__ = ["Thumbnail", "binned", "local_displacement", "match", "related", "shifted", "thumbnails"]
+__all__ = ["Thumbnail", "binned", "local_displacement", "match", "parabola", "related", "shifted", "thumbnails"]
 
 LONGEST = 256  # px of the longer side
 COARSE = 6.0  # px, standard deviation of the mean that is subtracted: vignettes and lamps are alike in all scenes
@@ -98,14 +99,17 @@ def match(first: Thumbnail, second: Thumbnail) -> tuple[float, Float[np.ndarray,
     row, column = np.unravel_index(surface.argmax(), shape)
     peak = float(surface[row, column])
 
-    def fraction(before: float, after: float) -> float:
-        curvature = before - 2 * peak + after
-        return 0.5 * (before - after) / curvature if curvature < 0 else 0.0
-
-    y = row + fraction(surface[row - 1, column], surface[(row + 1) % shape[0], column])
-    x = column + fraction(surface[row, column - 1], surface[row, (column + 1) % shape[1]])
+    y = row + parabola(surface[row - 1, column], peak, surface[(row + 1) % shape[0], column])[0]
+    x = column + parabola(surface[row, column - 1], peak, surface[row, (column + 1) % shape[1]])[0]
     wrapped = [(v + n / 2) % n - n / 2 for v, n in ((x, shape[1]), (y, shape[0]))]
     return peak, np.array(wrapped) * first.binning
+
+
+def parabola(before: float, top: float, after: float) -> tuple[float, float]:
+    """Return position from the middle and height of the peak of the parabola through three points."""
+    curvature = before - 2 * top + after
+    position = 0.5 * (before - after) / curvature if curvature < 0 else 0.0
+    return position, top - 0.25 * (before - after) * position
 
 
 def related(first: Thumbnail, second: Thumbnail) -> bool:
@@ -142,7 +146,6 @@ def local_displacement(
     """
     gy, gx = np.gradient(a)
     difference = a - b
-    rows, columns = (n // TILE for n in a.shape)
 
     def total(product: np.ndarray) -> np.ndarray:
         return binned(product, TILE).astype(np.float64)
@@ -151,15 +154,5 @@ def local_displacement(
     ridge = 0.05 * float(np.mean(xx + yy)) + 1e-12  # squares without pattern have no displacement
     xx, yy = xx + ridge, yy + ridge
     determinant = xx * yy - xy**2
-    d = np.stack([(yy * xd - xy * yd) / determinant, (xx * yd - xy * xd) / determinant], axis=-1).reshape(-1, 2)
-    y, x = (v.ravel() - v.mean() for v in np.mgrid[:rows, :columns].astype(float))
-    one, zero = np.ones_like(x), np.zeros_like(x)
-    design = np.stack([np.stack([one, zero, x, -y], -1), np.stack([zero, one, y, x], -1)], axis=1)
-    weight = np.ones(len(d))
-    for _ in range(3):
-        w = np.repeat(weight, 2)[:, None]
-        fit = np.linalg.lstsq(design.reshape(-1, 4) * w, d.ravel() * w[:, 0], rcond=None)[0]
-        rest = d - design @ fit
-        size = np.linalg.norm(rest, axis=-1)
-        weight = 1 / (1 + (size / (2 * np.median(size) + 1e-9)) ** 2)
-    return rest
+    d = np.stack([(yy * xd - xy * yd) / determinant, (xx * yd - xy * xd) / determinant], axis=-1)
+    return remove_shake(d, np.ones(d.shape[:2], dtype=bool)).reshape(-1, 2)

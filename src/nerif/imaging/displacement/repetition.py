@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Shaped
 
-from nerif.imaging.thumbnails import binned
+from nerif.imaging.thumbnails import binned, parabola
 
 __all__ = ["Repetition", "repetition"]
 
@@ -101,11 +101,11 @@ def _of_window(window: np.ndarray) -> Repetition | None:
         inner = profile[1:-1]
         peaks = 1 + np.flatnonzero((inner > profile[:-2]) & (inner >= profile[2:]) & (inner > HEIGHT))
         across = np.array([-direction[1], direction[0]])
-        return Repetition(tuple(across * (k + _fit(*profile[k - 1 : k + 2])[0]) for k in peaks[:1]), direction)
+        return Repetition(tuple(across * (k + parabola(*profile[k - 1 : k + 2])[0]) for k in peaks[:1]), direction)
     maxima: list[tuple[np.ndarray, float]] = []  # shift and height
     for r, c in np.argwhere((surface == maximum_filter(surface, 3)) & (surface > HEIGHT)):
         if 0 < r < len(surface) - 1 and 0 < c < surface.shape[1] - 1:
-            (x, left), (y, up) = _fit(*surface[r, c - 1 : c + 2]), _fit(*surface[r - 1 : r + 2, c])
+            (x, left), (y, up) = parabola(*surface[r, c - 1 : c + 2]), parabola(*surface[r - 1 : r + 2, c])
             shift = np.array([c + x - column, r + y - row])
             positive = shift[0] > 0.5 or (abs(shift[0]) <= 0.5 and shift[1] > 0)
             if positive and SHORTEST <= np.linalg.norm(shift) <= reach:
@@ -136,16 +136,8 @@ def _autocorrelation(window: np.ndarray) -> tuple[np.ndarray, tuple[int, int]]:
     if not total[0, 0] > 0:
         return np.empty((0, 0)), (0, 0)
     surface = fft.fftshift(total / np.maximum(count, 1) * (count[0, 0] / total[0, 0]))
-    row, column = (n // 2 for n in window.shape)
-    middle = window.shape
-    return surface[middle[0] - row : middle[0] + row + 1, middle[1] - column : middle[1] + column + 1], (row, column)
-
-
-def _fit(before: float, top: float, after: float) -> tuple[float, float]:
-    """Position from the middle and height of the parabola through three points."""
-    curvature = before - 2 * top + after
-    position = 0.5 * (before - after) / curvature if curvature < 0 else 0.0
-    return position, top - 0.25 * (before - after) * position
+    (height, width), (row, column) = window.shape, (n // 2 for n in window.shape)
+    return surface[height - row : height + row + 1, width - column : width + column + 1], (row, column)
 
 
 def _angle(a: np.ndarray, b: np.ndarray) -> float:
