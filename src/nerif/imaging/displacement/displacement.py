@@ -29,15 +29,9 @@ from nerif.imaging.readers.exposure import saturated
 from nerif.imaging.readers.frames import as_float
 
 __all__ = [
-    "OVEREXPOSED",
-    "DisplacementMap",
-    "DisplacementSettings",
-    "Reference",
-    "border",
-    "displacement",
-    "measure",
+    "OVEREXPOSED", "DisplacementMap", "DisplacementSettings", "Reference", "border", "displacement", "measure",
     "remove_shake",
-]
+]  # fmt: skip
 
 Grey = Shaped[np.ndarray, "row column"]
 Image = Float[np.ndarray, "row column"]
