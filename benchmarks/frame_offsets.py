@@ -26,8 +26,8 @@ from nerif.geometry import Box, Grid, Ring
 
 BOX, FRAMES, NOISE = Box.cube(50.0), 14, 0.05
 SPEED = {"puffs": 3.0, "turbulence": 1.5, "steady": 0.0}  # mm a frame
-OFFSETS: tuple[dict[int, int], ...] = ({}, {1: 1}, {2: -1}, {1: 2}, {3: -2}, {2: 4}, {0: 2, 3: 2})
-"""Frames by view."""
+OFFSETS = ("", "1:+1", "2:-1", "1:+2", "3:-2", "2:+4", "0:+2 3:+2")
+"""Views and their frames, as `text` writes them."""
 COLUMNS = {
     "flow": "{flow}", "views": "{views}", "late": "{late}", "seed": "{seed}", "named": "{named}", "right": "{right}",
     "seconds": "{seconds:.0f}",
@@ -36,13 +36,12 @@ COLUMNS = {
 
 def cases(quick: bool) -> Iterator[Settings]:
     if quick:
-        yield {"flow": "puffs", "views": 4, "late": [[1, 2]], "seed": 0}
+        yield {"flow": "puffs", "views": 4, "late": "1:+2", "seed": 0}
         return
-    for flow in SPEED:
-        for views in (6, 9, 12):
-            for offsets in OFFSETS if flow != "steady" else OFFSETS[:1]:
-                for seed in (0, 1):
-                    yield {"flow": flow, "views": views, "late": [list(pair) for pair in offsets.items()], "seed": seed}
+    moving = [(flow, views, late) for flow in ("puffs", "turbulence") for views in (6, 9, 12) for late in OFFSETS]
+    steady = [("steady", views, "") for views in (6, 9, 12) for _ in range(2)]
+    for seed, (flow, views, late) in enumerate(moving + steady):
+        yield {"flow": flow, "views": views, "late": late, "seed": seed}
 
 
 class Drifting(Field):
@@ -96,12 +95,16 @@ class Film:
         return self.frames[0]
 
 
-def measure(folder: Path, flow: str, views: int, late: list[list[int]], seed: int) -> dict[str, Any]:
-    offsets = dict(map(tuple, late))
+def text(offsets: dict[int, int]) -> str:
+    return " ".join(f"{view}:{frames:+d}" for view, frames in offsets.items())
+
+
+def measure(folder: Path, flow: str, views: int, late: str, seed: int) -> dict[str, Any]:
+    offsets = {int(view): int(frames) for view, frames in (part.split(":") for part in late.split())}
     excerpt = Excerpt(Film(flow, views, offsets, seed))  # type: ignore[arg-type]
     shifts = frame_shifts(excerpt, excerpt.liveliest())
     named = {i: shift.frames for i, shift in enumerate(shifts) if shift.clear}
-    return {"named": [list(pair) for pair in named.items()], "right": named == offsets}
+    return {"named": text(named), "right": named == offsets}
 
 
 def blocks(rows: list[dict[str, Any]]) -> list[str]:
