@@ -122,6 +122,7 @@ def test_a_large_offset_is_searched_further():
     assert frames_of(shifts_of(frames)) == [8, 0, 0]
 
 
+@pytest.mark.slow
 def test_two_views_show_a_difference_but_not_which_is_late(synchronous):
     frames = [frame.select(frame.names[:2]) for frame in late(synchronous, {1: 2})]
     found = check_film(Frames(frames), 12)

@@ -29,13 +29,14 @@ def chromium(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
 
 
 @pytest.fixture(scope="module")
-def browser(chromium: Any) -> Any:
-    """The browser with a window of a laptop, in the light, at rest."""
+def browser(chromium: Any) -> Iterator[Any]:
+    """The browser with a window of a laptop, in the light, at rest; an empty page after the file, as scenes draw on."""
     chromium.get("about:blank")
     chromium.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
     chromium.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
     chromium.set_window_size(1440, 900)
-    return chromium
+    yield chromium
+    chromium.get("about:blank")
 
 
 @pytest.fixture(scope="module")

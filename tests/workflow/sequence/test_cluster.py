@@ -71,7 +71,7 @@ def wait(out: Path, frames: int, process: subprocess.Popen, seconds: float = 120
         time.sleep(0.05)
 
 
-def workers_of(process: subprocess.Popen) -> list[psutil.Process]:
+def workers_of(process: subprocess.Popen | psutil.Process) -> list[psutil.Process]:
     """The processes that reconstruct."""
     children = psutil.Process(process.pid).children(recursive=True)
     return [c for c in children if any("spawn_main" in word for word in c.cmdline())]
@@ -86,9 +86,9 @@ def local() -> Iterator:
 
 
 def listening() -> set[tuple[str, int]]:
-    """Addresses that this process and its children listen on."""
+    """Addresses that this process and its workers listen on, but no browser of other tests."""
     process = psutil.Process()
-    connections = [c for p in (process, *process.children(recursive=True)) for c in p.net_connections()]
+    connections = [c for p in (process, *workers_of(process)) for c in p.net_connections()]
     return {(c.laddr.ip, c.laddr.port) for c in connections if c.status == psutil.CONN_LISTEN}
 
 
