@@ -122,6 +122,13 @@ def test_a_large_offset_is_searched_further():
     assert frames_of(shifts_of(frames)) == [8, 0, 0]
 
 
+def test_a_film_too_short_for_larger_offsets_is_named():
+    shifts = [Shift("a", 3, 50, True, at_end=True), Shift("b", 0, 0, True), Shift("c", 0, 0, True)]
+    (finding,) = late_views(shifts, {})
+    assert "3 frames late, or more, as the film is too short for larger offsets" in str(finding)
+    assert "too short" not in str(late_views([replace(shifts[0], at_end=False), *shifts[1:]], {})[0])
+
+
 @pytest.mark.slow
 def test_two_views_show_a_difference_but_not_which_is_late(synchronous):
     frames = [frame.select(frame.names[:2]) for frame in late(synchronous, {1: 2})]

@@ -20,7 +20,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -38,7 +38,6 @@ from nerif.analysis.consistency import (
 from nerif.common.conventions import InputError
 from nerif.common.findings import Finding
 from nerif.data.measurement import Measurement, integrals_of
-from nerif.data.measurement_sequence import MeasurementSequence
 from nerif.reconstruction.aperture import apply_aperture
 from nerif.reconstruction.device import on_free_cores
 
@@ -56,6 +55,15 @@ OCTAVES = (1, 2, 4, 8, 16, 32)  # first frequencies of the bands but the lowest,
 MIN_COUNT, MAX_CORRELATION = 8, 0.999  # of a band
 
 
+@runtime_checkable
+class Film(Protocol):
+    """What the check needs of a film, such as a MeasurementSequence."""
+
+    def __len__(self) -> int: ...
+    def frame(self, index: int) -> Measurement: ...
+    def fullest(self) -> Measurement: ...
+
+
 class Excerpt:
     """Some instants of a film, binned, by one technique and the views of its fullest instant; read when needed.
 
@@ -65,7 +73,7 @@ class Excerpt:
     aperture : depth of field, as in NeRIF
     """
 
-    def __init__(self, film: MeasurementSequence, aperture: str = "auto") -> None:
+    def __init__(self, film: Film, aperture: str = "auto") -> None:
         self.film, self.aperture = film, aperture
         self.names = self.measurement(film.fullest()).names
         self._frames: dict[int, Measurement | None] = {}
@@ -230,12 +238,14 @@ class Shift:
     frames : positive if the film is late
     gain : of evidence, over no shift
     sharp : whether every other shift would fit clearly worse
+    at_end : whether the film is too short for a larger shift
     """
 
     name: str
     frames: int
     gain: float
     sharp: bool
+    at_end: bool = False
 
     @property
     def clear(self) -> bool:
@@ -274,7 +284,13 @@ def frame_shifts(
         shifts, evidences = best
     (usual, _), *_ = Counter(shifts).most_common(1)  # most films are synchronous
     return tuple(
-        Shift(name, frames := shift - usual, e.by_shift[0] - e.by_shift.get(-frames, 0.0), e.sharp)
+        Shift(
+            name,
+            frames := shift - usual,
+            e.by_shift[0] - e.by_shift.get(-frames, 0.0),
+            e.sharp,
+            at_end=(1 if shift > 0 else -1) not in e.by_shift,
+        )
         for name, shift, e in zip(excerpt.names, shifts, evidences, strict=True)
     )
 
@@ -301,6 +317,8 @@ def late_views(shifts: Sequence[Shift], frame_offsets: Mapping[str, int]) -> lis
         films = f"{'its film is' if len(views) == 1 else 'their films are'} {_words(late)}"
         if undecided:
             films += f", or the other views {_words(-late)}; equal numbers of views do not decide"
+        if any(shift.at_end for shift in shifts if shift.name in views):
+            films += ", or more, as the film is too short for larger offsets: measure more frames to be sure"
         gains = ", ".join(f"{shift.gain:.0f}" for shift in shifts if shift.name in views)
         options = " ".join(f"--frame-offset {name} {frame_offsets.get(name, 0) + late}" for name in views)
         subject = Finding.subject(views, len(shifts))
@@ -318,7 +336,7 @@ def _words(late: int) -> str:
 
 @on_free_cores
 def check_film(
-    film: MeasurementSequence, voxels: int = 24, on_step: Callable[[int, int], None] = lambda done, total: None,
+    film: Film, voxels: int = 24, on_step: Callable[[int, int], None] = lambda done, total: None,
     aperture: str = "auto",
 ) -> Consistency:  # fmt: skip
     """Find views whose films are late or early, and compare the views of one instant with each other.
@@ -358,7 +376,7 @@ def check_film(
     return replace(result, findings=(*findings, *result.findings), remarks=(*remarks, *result.remarks))
 
 
-def _synchronous(film: MeasurementSequence, instant: int, shifts: Mapping[str, int]) -> Measurement:
+def _synchronous(film: Film, instant: int, shifts: Mapping[str, int]) -> Measurement:
     """The measurement of one instant, with some views from frames that many later."""
     result = film.frame(instant)
     for name, shift in shifts.items():

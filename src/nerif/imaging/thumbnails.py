@@ -85,7 +85,7 @@ def thumbnails(view: View, source: str, most: int, shape: tuple[int, ...]) -> It
         return
 
 
-def binned(image: Shaped[np.ndarray, "row column"], binning: int) -> Float[np.ndarray, "row column"]:
+def binned(image: Shaped[np.ndarray, "row column"], binning: int) -> Float[np.ndarray, "rows columns"]:
     """Return the mean over squares of `binning` px; incomplete ones at the edges are dropped."""
     rows, columns = (n // binning for n in image.shape)
     part = as_float(image[: rows * binning, : columns * binning])
@@ -94,7 +94,7 @@ def binned(image: Shaped[np.ndarray, "row column"], binning: int) -> Float[np.nd
 
 def match(first: Thumbnail, second: Thumbnail) -> tuple[float, Float[np.ndarray, " 2"]]:
     """Return the highest correlation of two images over all shifts, and the shift (x, y) of the second, px."""
-    surface = _correlation(first, second)
+    surface = _correlation(first, second).astype(np.float64)
     shape = surface.shape
     row, column = np.unravel_index(surface.argmax(), shape)
     peak = float(surface[row, column])

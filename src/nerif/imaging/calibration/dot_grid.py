@@ -118,7 +118,7 @@ def _grow(
     return places
 
 
-def _regular(lines: Int[np.ndarray, "n 3"], centres: Float[np.ndarray, "n 2"]) -> DotGrid | None:
+def _regular(lines: Int[np.ndarray, "lines 3"], centres: Float[np.ndarray, "n 2"]) -> DotGrid | None:
     """The grid if its lines are all complete, but for lines less than half full at its edges."""
     lines = _trimmed(lines)
     if len(lines) < 4:
@@ -132,7 +132,7 @@ def _regular(lines: Int[np.ndarray, "n 3"], centres: Float[np.ndarray, "n 2"]) -
     return DotGrid(grid, len(lines))
 
 
-def _trimmed(lines: Int[np.ndarray, "n 3"]) -> Int[np.ndarray, "n 3"]:
+def _trimmed(lines: Int[np.ndarray, "lines 3"]) -> Int[np.ndarray, "trimmed 3"]:
     """The dots without those in lines at the edges that are less than half full."""
     while len(lines):
         for axis, end in ((0, 0), (0, -1), (1, 0), (1, -1)):
@@ -146,7 +146,7 @@ def _trimmed(lines: Int[np.ndarray, "n 3"]) -> Int[np.ndarray, "n 3"]:
 
 
 def _asymmetric(
-    lines: Int[np.ndarray, "n 3"], centres: Float[np.ndarray, "n 2"], diameters: Float[np.ndarray, " n"]
+    lines: Int[np.ndarray, "lines 3"], centres: Float[np.ndarray, "n 2"], diameters: Float[np.ndarray, " n"]
 ) -> DotGrid | None:
     """The grid if its diagonals are the rows and columns of a complete asymmetric grid."""
     dots = lines[:, 2]

@@ -6,10 +6,10 @@ import math
 import operator
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, SupportsIndex
 
 import numpy as np
 
@@ -144,7 +144,7 @@ class Frames(ABC):
             return 8
         return 1 if self.layout.dtype == np.float32 and self.layout.peak <= 1 else 16
 
-    def __getitem__(self, i: int) -> np.ndarray:
+    def __getitem__(self, i: SupportsIndex) -> np.ndarray:
         """Return frame `i`; InputError if it is unreadable, or differs from the others in size or type."""
         n, i = len(self), operator.index(i)
         if not -n <= i < n:
@@ -237,6 +237,7 @@ def _grey(image: np.ndarray) -> np.ndarray:
 
 def read_each(frames: Frames, indices: Iterable[int]) -> Iterator[tuple[int, np.ndarray | InputError]]:
     """Read frames one after the other: the image, or the error."""
+    read: Callable[[int], np.ndarray]
     try:
         read = frames.__getitem__ if frames.shape else frames.single
     except InputError:  # no readable frame
