@@ -264,9 +264,9 @@ def test_missing_curves_and_truth_are_no_fault_of_the_result(copy):
 @pytest.mark.parametrize(
     ("name", "content", "phrase"),
     [
-        ("metrics.json", '{"views": [1]}', "views"),
-        pytest.param("metrics.json", '{"uncertainty": 2}', "uncertainty", marks=pytest.mark.slow),
-        pytest.param("metrics.json", '{"coverage": {}}', "coverage", marks=pytest.mark.slow),
+        ("metrics.json", '{"version": 1, "views": [1]}', "views"),
+        pytest.param("metrics.json", '{"version": 1, "uncertainty": 2}', "uncertainty", marks=pytest.mark.slow),
+        pytest.param("metrics.json", '{"version": 1, "coverage": {}}', "coverage", marks=pytest.mark.slow),
         pytest.param("metrics.json", "[]", "table", marks=pytest.mark.slow),
         ("history.csv", "a,b\n1,2\n", "seconds"),
     ],
