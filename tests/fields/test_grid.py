@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from nerif.common.conventions import FACES
+from nerif.fields import grid
 from nerif.fields.grid import Boundary, VoxelField, spline_weights
 from nerif.geometry import Box, Grid
 from refusals import refused
@@ -53,6 +54,43 @@ def test_gradient_is_exact(degree):
     field = VoxelField(Boundary(("x+",)).extend(random(*GRID.shape), (degree + 1) // 2), GRID, degree)
     points = torch.tensor(BOX.lower) + (0.03 + 0.94 * random(60, 3, seed=3)) * torch.tensor(BOX.edges)
     points.requires_grad_(True)
+    value, gradient = field.value_and_gradient(points)
+    (expected,) = torch.autograd.grad(value.sum(), points)
+    assert torch.allclose(gradient, expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("degree", [1, 3])
+def test_the_compiled_kernel_equals_its_readable_twin(degree, dtype, threads, monkeypatch):
+    field = VoxelField(Boundary(("x+",)).extend(random(*GRID.shape), (degree + 1) // 2).to(dtype), GRID, degree)
+    points = 1.3 * (2 * random(30_000, 3, seed=4) - 1) * torch.tensor(BOX.upper)  # some of them outside
+    points[:6, 0], points[6:9] = points.new_tensor([-12, 12, -12, 12, torch.inf, -torch.inf]), GRID.points()[0, 0, :3]
+    points = points.to(dtype).reshape(3, -1, 3)
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        results = field.value_and_gradient(points)
+    finally:
+        torch.set_num_threads(before)
+    monkeypatch.setattr(grid, "MANY_POINTS", 1 << 30)
+    twin = VoxelField(field.coefficients.double(), GRID, degree)  # the kernel is in double precision
+    for result, expected in zip(results, twin.value_and_gradient(points.double()), strict=True):
+        assert (result.dtype, result.shape) == (dtype, expected.shape)
+        assert torch.allclose(result.double(), expected, rtol=1e-6 if dtype == torch.float32 else 0, atol=1e-13)
+
+
+def test_a_place_that_is_not_a_number_has_no_value():
+    points = torch.full((5000, 3), 1.0, dtype=torch.float64)
+    points[7, 1] = torch.nan
+    value, gradient = VoxelField.through(random(*GRID.shape), GRID).value_and_gradient(points)
+    assert bool(value[7].isnan()) and bool(gradient[7].isnan().all())
+    assert int(value.isnan().sum()) == 1
+
+
+def test_derivatives_by_many_points_are_there():
+    field = VoxelField.through(random(*GRID.shape), GRID)
+    points = (random(5000, 3, seed=3) * 10).requires_grad_(True)
     value, gradient = field.value_and_gradient(points)
     (expected,) = torch.autograd.grad(value.sum(), points)
     assert torch.allclose(gradient, expected, atol=1e-12)

@@ -22,6 +22,7 @@ from nerif.geometry import Grid
 __all__ = ["DEGREES", "Boundary", "VoxelField", "spline_coefficients", "spline_weights"]
 
 DEGREES = {"linear": 1, "cubic": 3}
+MANY_POINTS = 4096  # below, importing the compiler takes longer
 
 
 class VoxelField(Field):
@@ -69,6 +70,12 @@ class VoxelField(Field):
     def value_and_gradient(self, points: Points) -> tuple[Values, Vectors]:
         box, shape = self.grid.box, points.shape
         p = points.reshape(-1, 3)
+        if self._compiled_for(p):
+            from nerif.fields.spline_kernel import evaluate
+
+            corners = box.lower, box.upper, self.grid.spacing
+            value, gradient = evaluate(self.coefficients, self.degree, p, *corners)
+            return value.reshape(shape[:-1]), gradient.reshape(shape)
         inside = torch.minimum(torch.maximum(p, p.new_tensor(box.lower)), p.new_tensor(box.upper))
         position = (inside - p.new_tensor(box.lower)) / p.new_tensor(self.grid.spacing) - 0.5
         cell = position.floor()
@@ -91,6 +98,12 @@ class VoxelField(Field):
                 gy += along * slopes[:, 1, j] * wz
                 gz += along * wy * slopes[:, 2, k]
         return value.reshape(shape[:-1]), torch.stack([gx, gy, gz], dim=-1).reshape(shape)
+
+    def _compiled_for(self, p: Tensor) -> bool:
+        """Whether the compiled kernel evaluates points: many of them, on a CPU, without derivatives by them."""
+        differentiable = torch.is_grad_enabled() and (p.requires_grad or self.coefficients.requires_grad)
+        on_cpu = p.device.type == self.coefficients.device.type == "cpu"
+        return on_cpu and len(p) >= MANY_POINTS and not differentiable and p.dtype in (torch.float32, torch.float64)
 
 
 @dataclass(frozen=True)

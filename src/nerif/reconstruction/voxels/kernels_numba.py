@@ -9,7 +9,6 @@ the gradient and one for the value. Indices are unsigned, since signed ones are 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import torch
@@ -17,10 +16,10 @@ from numba import njit, prange
 from numba.extending import overload
 from torch import Tensor
 
-__all__ = ["CUBIC", "FASTMATH", "GRADIENT", "LINEAR", "VALUE", "integrate", "profile_at", "spread", "weights_at"]
+from nerif.fields.spline_kernel import CUBIC, FASTMATH, LINEAR, weights_at
 
-FASTMATH = {"reassoc", "contract", "nsz", "arcp"}  # without the promise of finite numbers: a NaN stays a NaN
-LINEAR, CUBIC = (0.0, 0.0), (0.0, 0.0, 0.0, 0.0)
+__all__ = ["GRADIENT", "VALUE", "integrate", "profile_at", "spread"]
+
 VALUE, GRADIENT = (0.0,), (0.0, 0.0, 0.0)
 SLAB_PLANES = 8  # that a thread adds to at a time, and that stay in its cache
 
@@ -41,28 +40,6 @@ def spread(degree: int, sums: Tensor, path: Sequence[Tensor], shape: Sequence[in
     arrays = [a.numpy() for a in (*path, sums)]
     _spread(planes[0], planes[-1], *arrays, LINEAR if degree == 1 else CUBIC, part)
     return [torch.from_numpy(plane) for plane in planes]
-
-
-def _linear(t: Any, spline: Any) -> Any:
-    return (1 - t, t), (-1.0, 1.0)
-
-
-def _cubic(t: Any, spline: Any) -> Any:
-    s = 1 - t
-    t2, s2 = t * t, s * s
-    weights = (s2 * s / 6, 2 / 3 - t2 + 0.5 * t2 * t, 2 / 3 - s2 + 0.5 * s2 * s, t2 * t / 6)
-    slopes = (-0.5 * s2, 1.5 * t2 - 2 * t, 2 * s - 1.5 * s2, 0.5 * t2)
-    return weights, slopes
-
-
-def weights_at(t: Any, spline: Any) -> Any:
-    """Weights of the neighbours and their slopes, as in fields.grid.spline_weights."""
-    return _linear(t, spline) if len(spline) == 2 else _cubic(t, spline)
-
-
-@overload(weights_at, jit_options={"fastmath": FASTMATH})
-def _compiled_weights(t: Any, spline: Any) -> Any:
-    return _linear if len(spline) == 2 else _cubic
 
 
 def _even_weight(profile, m):

@@ -13,7 +13,8 @@ import torch
 from numba import njit, prange
 from torch import Tensor
 
-from nerif.reconstruction.voxels.kernels_numba import CUBIC, FASTMATH, GRADIENT, LINEAR, VALUE, profile_at, weights_at
+from nerif.fields.spline_kernel import CUBIC, FASTMATH, LINEAR, weights_at
+from nerif.reconstruction.voxels.kernels_numba import GRADIENT, VALUE, profile_at
 
 __all__ = ["integrate", "spread"]
 
