@@ -84,7 +84,8 @@ def test_a_place_that_is_not_a_number_has_no_value():
     points = torch.full((5000, 3), 1.0, dtype=torch.float64)
     points[7, 1] = torch.nan
     value, gradient = VoxelField.through(random(*GRID.shape), GRID).value_and_gradient(points)
-    assert bool(value[7].isnan()) and bool(gradient[7].isnan().all())
+    assert bool(value[7].isnan())
+    assert bool(gradient[7].isnan().all())
     assert int(value.isnan().sum()) == 1
 
 

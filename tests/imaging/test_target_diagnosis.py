@@ -194,7 +194,7 @@ def test_without_a_target_none_is_named(kind):
     ("change", "cause"),
     [
         slow({"blur": 5.0}, "px wide: out of focus"),
-        ({"shape": (600, 800), "fill": 0.24}, "px wide, and need 12 px or more"),
+        slow({"shape": (600, 800), "fill": 0.24}, "px wide, and need 12 px or more"),
     ],
 )
 def test_faults_of_images_are_measured(change, cause):
