@@ -5,6 +5,8 @@ from __future__ import annotations
 import subprocess
 import sys
 
+from nerif.cli.cli import INPUTS
+
 HEAVY = (
     "xarray",
     "matplotlib",
@@ -48,3 +50,9 @@ def test_core_imports_torch_and_numpy_only():
 
 def test_help_loads_neither_torch_nor_numpy():
     assert not loaded_by("from nerif.cli.cli import main; main(['--help'])") & {"torch", "numpy", *HEAVY}
+
+
+def test_a_missing_input_is_refused_before_anything_heavy_is_loaded():
+    for command in INPUTS:
+        refused = f"from nerif.cli.cli import main; assert main(['{command}', 'absent', '-o', 'x']) == 2; print()"
+        assert not loaded_by(refused) & {"torch", "numpy", *HEAVY}

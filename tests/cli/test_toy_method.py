@@ -78,7 +78,7 @@ def test_help_lists_it_and_its_settings(toy, capsys):
     assert toy.about() in capsys.readouterr().out
     assert run("reconstruct", "--method", "toy", "--help", "all") == 0
     assert "--gait {slow,brisk}" in capsys.readouterr().out
-    assert run("reconstruct", "m.nc", "-o", "r", "--method", "toys") == 2
+    assert run("reconstruct", ".", "-o", "r", "--method", "toys") == 2
     assert "mart, toy, got 'toys'" in capsys.readouterr().err
 
 

@@ -60,12 +60,13 @@ def test_the_other_package_is_named_with_the_remedy(tmp_path, monkeypatch, versi
     assert ("pip uninstall nerif" in stranger()) == bool(warning)
 
 
-def test_a_command_warns_in_one_line(monkeypatch, capsys):
+def test_a_command_warns_in_one_line(tmp_path, monkeypatch, capsys):
+    (tmp_path / "damaged.nc").write_text("no NetCDF")
     monkeypatch.setattr("nerif.common.installation.stranger", lambda: "the package nerif 1.4.0")
-    assert main(["info", "nowhere.nc"]) == 2
+    assert main(["info", str(tmp_path / "damaged.nc")]) == 2
     first, second = capsys.readouterr().err.splitlines()
     assert first == "nerif: the package nerif 1.4.0"
-    assert "nowhere.nc" in second
+    assert "damaged.nc" in second
 
 
 def test_help_does_not_check_for_it():

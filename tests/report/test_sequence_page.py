@@ -72,7 +72,7 @@ def test_a_store_without_frames_is_refused(tmp_path, capsys):
         render_sequence(store)
     assert main(["report", str(tmp_path / "r.zarr")]) == 2
     assert main(["report", str(tmp_path / "none.zarr")]) == 2
-    assert "no such store" in capsys.readouterr().err
+    assert "none.zarr: no such directory; expected one" in capsys.readouterr().err
 
 
 @pytest.mark.slow

@@ -2,12 +2,11 @@
 
 VoxelField.value_and_gradient is the readable twin. Branches are resolved at compile time by the length of the tuple
 `spline`, which has one entry per neighbour. Indices are unsigned, since signed ones are tested for counting from the
-end. Points are shared between Python threads, which any thread may start, unlike those of Numba.
+end. It runs in the thread that calls it, without Python's lock, so that several may run side by side.
 """
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -20,7 +19,6 @@ __all__ = ["CUBIC", "FASTMATH", "LINEAR", "evaluate", "weights_at"]
 
 FASTMATH = {"reassoc", "contract", "nsz", "arcp"}  # without the promise of finite numbers: a NaN stays a NaN
 LINEAR, CUBIC = (0.0, 0.0), (0.0, 0.0, 0.0, 0.0)
-PIECE = 1 << 13  # points of a thread, or more
 
 
 def evaluate(coefficients: Tensor, degree: int, points: Tensor, lower: Any, upper: Any, spacing: Any) -> Any:
@@ -28,14 +26,7 @@ def evaluate(coefficients: Tensor, degree: int, points: Tensor, lower: Any, uppe
     values, gradients = np.empty(len(points)), np.empty((len(points), 3))
     where, c = points.detach().numpy(), coefficients.detach().contiguous().numpy()
     box, spline = np.array([lower, upper, spacing]), LINEAR if degree == 1 else CUBIC
-    pieces = max(1, min(torch.get_num_threads(), len(points) // PIECE))
-    ends = [i * len(points) // pieces for i in range(pieces + 1)]
-    run = lambda a, b: _evaluate(c, where[a:b], box, values[a:b], gradients[a:b], spline)  # noqa: E731
-    if pieces == 1:
-        run(*ends)
-    else:
-        with ThreadPoolExecutor(pieces) as threads:
-            list(threads.map(run, ends[:-1], ends[1:]))
+    _evaluate(c, where, box, values, gradients, spline)
     return torch.from_numpy(values).to(points), torch.from_numpy(gradients).to(points)
 
 
