@@ -5,7 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 
-from nerif.cli.cli import INPUTS
+from nerif.cli.cli import INPUTS, main
 
 HEAVY = (
     "xarray",
@@ -56,3 +56,7 @@ def test_a_missing_input_is_refused_before_anything_heavy_is_loaded():
     for command in INPUTS:
         refused = f"from nerif.cli.cli import main; assert main(['{command}', 'absent', '-o', 'x']) == 2; print()"
         assert not loaded_by(refused) & {"torch", "numpy", *HEAVY}
+
+
+def test_help_needs_no_input():
+    assert main(["figures", "absent", "--help"]) == 0

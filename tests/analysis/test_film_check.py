@@ -130,6 +130,13 @@ def test_a_film_too_short_for_larger_offsets_is_named():
 
 
 @pytest.mark.slow
+def test_the_end_of_a_film_is_near(synchronous):
+    frames = late(film_of([rising(i) for i in range(40)], 4), {2: 2})
+    first = next(t for t in range(len(frames)) if frames_of(shifts_of(frames[t : t + 10]))[2] == 2)
+    assert [shifts_of(part)[2].at_end for part in (frames[first : first + 10], frames)] == [True, False]
+
+
+@pytest.mark.slow
 def test_two_views_show_a_difference_but_not_which_is_late(synchronous):
     frames = [frame.select(frame.names[:2]) for frame in late(synchronous, {1: 2})]
     found = check_film(Frames(frames), 12)

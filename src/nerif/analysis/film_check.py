@@ -289,7 +289,7 @@ def frame_shifts(
             frames := shift - usual,
             e.by_shift[0] - e.by_shift.get(-frames, 0.0),
             e.sharp,
-            at_end=(1 if shift > 0 else -1) not in e.by_shift,
+            (1 if frames > 0 else -1) not in e.by_shift,
         )
         for name, shift, e in zip(excerpt.names, shifts, evidences, strict=True)
     )

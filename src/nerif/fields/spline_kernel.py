@@ -2,7 +2,7 @@
 
 VoxelField.value_and_gradient is the readable twin. Branches are resolved at compile time by the length of the tuple
 `spline`, which has one entry per neighbour. Indices are unsigned, since signed ones are tested for counting from the
-end. It runs in the thread that calls it, without Python's lock, so that several may run side by side.
+end. The kernel has one thread, the caller's: Numba's threads may be started by one Python thread at a time.
 """
 
 from __future__ import annotations
