@@ -18,14 +18,13 @@ from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.uncertainty.bootstrap import (
     BLOCK,
     LOST,
-    VOXELS,
-    WIDTH,
-    Deviations,
+    BootstrapDeviations,
     Member,
     Original,
     Trials,
     best_covered,
 )  # fmt: skip
+from nerif.reconstruction.uncertainty.deviations import VOXELS, WIDTH
 from refusals import refused
 
 AMBIENT = 1.00027
@@ -93,10 +92,10 @@ def test_deviations_grow_with_the_detail_that_trials_lose(original, share):
     """They do not shrink if trials have more of it."""
     grid = Grid.of_resolution(BOX, 24)
     truth = Volume.of(hot(BOX, 0.1).sample(grid), grid, "index_excess", AMBIENT)
-    deviations = Deviations(truth, GasSettings(), original)
+    deviations = BootstrapDeviations(truth, GasSettings(), original)
     for _ in range(2):
         member = Member(NeRIF(), original.measurement, truth)
-        deviations.add(member, trial_of(truth, (share - 1) * truth.values.double()))
+        deviations.add_trial(member, trial_of(truth, (share - 1) * truth.values.double()))
     assert deviations.lost == pytest.approx(max(1 - share**2, 0), abs=1e-4)
     ratio = float(deviations.std().values.norm() / (abs(1 - share) * truth.values.norm()))
     assert ratio == pytest.approx(deviations.better * math.exp(LOST * deviations.lost**0.5), rel=0.02)
@@ -107,17 +106,17 @@ def test_deviations_shrink_with_the_residual_relative_to_that_of_trials(original
     projections = original.project(original.result.field)["deflection"].to(original.measurement.displacement)
     residual = original.measurement.displacement - projections
     truth = original.result.volume(Grid.of_resolution(original.result.box, 16))
-    deviations = Deviations(truth, GasSettings(), original)
+    deviations = BootstrapDeviations(truth, GasSettings(), original)
     assert deviations.better == 1.0  # without trials
     for _ in range(2):
         data = replace(original.measurement, displacement=projections + worse * residual)
-        deviations.add(Member(NeRIF(), data, truth), original.result)
+        deviations.add_trial(Member(NeRIF(), data, truth), original.result)
     assert deviations.better == pytest.approx(1 / worse if worse else 1.0, rel=1e-3)
 
 
 def test_a_field_without_detail_has_lost_none(original):
-    deviations = Deviations(flat(16), GasSettings(), original)
-    deviations.add(Member(NeRIF(), original.measurement, flat(16)), trial_of(flat(16), -5e-6))
+    deviations = BootstrapDeviations(flat(16), GasSettings(), original)
+    deviations.add_trial(Member(NeRIF(), original.measurement, flat(16)), trial_of(flat(16), -5e-6))
     std = deviations.std().values
     torch.testing.assert_close(std, torch.full_like(std, deviations.better * 5e-6), rtol=1e-3, atol=0)
 
@@ -129,10 +128,10 @@ def test_views_are_covered_by_neighbours_and_opposite_views():
 
 
 def test_standard_deviations_average_the_squares_of_errors_around_each_voxel(original):
-    deviations, generator = Deviations(flat(32), GasSettings(), original), torch.Generator().manual_seed(0)
+    deviations, generator = BootstrapDeviations(flat(32), GasSettings(), original), torch.Generator().manual_seed(0)
     for size in (3e-6, 4e-6):
         error = size * torch.randn(flat(16).grid.shape, generator=generator, dtype=torch.float64)
-        deviations.add(Member(NeRIF(), original.measurement, flat(16)), trial_of(flat(16), error))
+        deviations.add_trial(Member(NeRIF(), original.measurement, flat(16)), trial_of(flat(16), error))
     volumes = {v.quantity: v for v in deviations.volumes()}
     assert deviations.count == 2
     std = volumes["index_excess_std"].values
@@ -153,9 +152,9 @@ def test_standard_deviations_average_the_squares_of_errors_around_each_voxel(ori
 
 
 def test_temperatures_beyond_the_relation_are_masked_and_counted(original):
-    deviations = Deviations(flat(8, -2.6e-4), GasSettings(), original)
+    deviations = BootstrapDeviations(flat(8, -2.6e-4), GasSettings(), original)
     member = Member(NeRIF(), original.measurement, flat(8, -2.3e-4))
-    deviations.add(member, trial_of(flat(8, -2.6e-4), 0.0))
+    deviations.add_trial(member, trial_of(flat(8, -2.6e-4), 0.0))
     volumes = {v.quantity: v for v in deviations.volumes()}
     assert volumes["temperature_p95"].notes["masked_voxels"] == 8**3
     assert float(volumes["index_excess_std"].values.mean()) == pytest.approx(deviations.better * 3e-5, rel=1e-3)

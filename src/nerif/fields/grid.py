@@ -175,12 +175,15 @@ def spline_weights(t: Tensor, degree: int) -> tuple[Tensor, Tensor]:
     return weights, slopes
 
 
-def spline_coefficients(values: Float[Tensor, "z y x"], degree: int, boundary: Boundary) -> Float[Tensor, "z y x"]:
-    """Return the coefficients within a boundary of the spline with these values at the voxel centres."""
+def spline_coefficients(
+    values: Float[Tensor, "z y x"], degree: int, boundary: Boundary, axes: Sequence[int] = (0, 1, 2)
+) -> Float[Tensor, "z y x"]:
+    """Return the coefficients within a boundary of the spline along axes with these values at the voxel centres."""
     if degree == 1:
         return values
     coefficients = values.to(torch.float64)
-    for axis, n in enumerate(values.shape):
+    for axis in axes:
+        n = values.shape[axis]
         unit = torch.eye(n, dtype=torch.float64, device=values.device)[..., None].movedim(0, axis)
         coefficients = _prefilter(coefficients, axis, boundary.extend(unit, 1, (axis,)).movedim(axis, 0)[..., 0])
     return coefficients.to(values.dtype)

@@ -13,6 +13,7 @@ from nerif.common.conventions import InputError, Points, Values, Vectors
 from nerif.fields.base import Field, in_chunks
 from nerif.fields.grid import VoxelField
 from nerif.fields.network import ACTIVATIONS, UNBOUNDED, Network, NetworkShape, NeuralField, encode, encode_pullback
+from nerif.fields.sum import SumField
 from nerif.geometry import Grid
 from nerif.geometry.symmetry import Symmetry
 
@@ -66,6 +67,8 @@ class SymmetricNetwork(Network):
 
 def symmetry_of_field(field: Field) -> Symmetry | None:
     """Return the symmetry that a field has by construction, mm, or None."""
+    if isinstance(field, SumField):
+        return symmetry_of_field(field.parts[0])
     if isinstance(field, SymmetricVoxels):
         return field.symmetry
     if isinstance(field, NeuralField) and isinstance(field.network, SymmetricNetwork):

@@ -161,6 +161,7 @@ class Reconstructor(ABC):
     title: ClassVar[str]  # as printed
     aperture: str  # whether pixels have an aperture (aperture.py)
     source: str  # images, displacements or both (sources.py)
+    detailed: ClassVar[bool] = False  # detail is added to its field (detail.py) where that pays
 
     @classmethod
     def about(cls) -> str:

@@ -23,6 +23,7 @@ from nerif.data.volume import INDEX
 from nerif.fields.base import Field
 from nerif.fields.grid import VoxelField
 from nerif.fields.network import Network, NetworkShape, NeuralField
+from nerif.fields.sum import SumField
 from nerif.fields.symmetric import SymmetricNetwork, SymmetricVoxels
 from nerif.forward.registry import forward_model
 from nerif.geometry import Box, Camera, Grid
@@ -101,27 +102,34 @@ def digest(parts: Iterable[Any]) -> str:
 
 def write_field(directory: Path, result: Reconstruction) -> None:
     """Write a field atomically, with everything needed to evaluate it."""
-    field = result.field
     about = {"n_ambient": result.n_ambient, "outcome": vars(result.outcome), "quantity": result.quantity}
+    tensors, entries = _entries_of(result.field)
+    _save(directory / FIELD, tensors, {**about, "box": [result.box.lower, result.box.upper], **entries})
+
+
+def _entries_of(field: Field) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """The tensors of a field and the entries of its header."""
+    if isinstance(field, SumField):
+        tensors, parts = dict[str, Tensor](), list[dict[str, Any]]()
+        for i, part in enumerate(field.parts):
+            of_part, entries = _entries_of(part)
+            tensors |= {f"{i}.{name}": tensor for name, tensor in of_part.items()}
+            parts.append(entries)
+        return tensors, {"kind": "sum", "parts": parts}
     if isinstance(field, VoxelField):
-        box = field.grid.box
-        about |= {"kind": "voxels", "shape": field.grid.shape, "degree": field.degree}
-        tensors = {"coefficients": field.coefficients.cpu().contiguous()}
-    elif isinstance(field, SymmetricVoxels):
-        box, grid = result.box, field.parts[0].grid
-        reduced = [grid.box.lower, grid.box.upper]
-        about |= {"kind": "symmetric voxels", "shape": grid.shape, "degree": field.parts[0].degree}
-        about |= {"reduced_box": reduced, "symmetry": asdict(field.symmetry)}
-        tensors = {"coefficients": torch.stack([part.coefficients.cpu() for part in field.parts])}
-    else:
-        assert isinstance(field, NeuralField)
-        box = field.box
-        about |= {"kind": "neural", "network": vars(field.network.shape)}
-        if isinstance(field.network, SymmetricNetwork):
-            about["symmetry"] = asdict(field.network.symmetry)
-        about |= {"index_scale": field.scale, "offset": field.offset}
-        tensors = {k: v.detach().cpu().contiguous() for k, v in field.network.state_dict().items()}
-    _save(directory / FIELD, tensors, {**about, "box": [box.lower, box.upper]})
+        entries = {"kind": "voxels", "shape": field.grid.shape, "degree": field.degree}
+        return {"coefficients": field.coefficients.cpu().contiguous()}, entries
+    if isinstance(field, SymmetricVoxels):
+        grid = field.parts[0].grid
+        entries = {"kind": "symmetric voxels", "shape": grid.shape, "degree": field.parts[0].degree}
+        entries |= {"reduced_box": [grid.box.lower, grid.box.upper], "symmetry": asdict(field.symmetry)}
+        return {"coefficients": torch.stack([part.coefficients.cpu() for part in field.parts])}, entries
+    assert isinstance(field, NeuralField)
+    entries = {"kind": "neural", "network": vars(field.network.shape)}
+    if isinstance(field.network, SymmetricNetwork):
+        entries["symmetry"] = asdict(field.network.symmetry)
+    entries |= {"index_scale": field.scale, "offset": field.offset}
+    return {k: v.detach().cpu().contiguous() for k, v in field.network.state_dict().items()}, entries
 
 
 def read_field(directory: Path) -> tuple[Field, Box, float]:
@@ -134,25 +142,33 @@ def read_field(directory: Path) -> tuple[Field, Box, float]:
     tensors, about = _load(path)
     try:
         lower, upper = about["box"]
-        box, n_ambient = Box(tuple(lower), tuple(upper)), float(about["n_ambient"])
-        if about["kind"] == "voxels":
-            grid = Grid(box, tuple(about["shape"]))
-            return VoxelField(tensors["coefficients"], grid, int(about["degree"])), box, n_ambient
-        if about["kind"] == "symmetric voxels":
-            lower, upper = about["reduced_box"]
-            grid = Grid(Box(tuple(lower), tuple(upper)), tuple(about["shape"]))
-            parts = [VoxelField(c, grid, int(about["degree"])) for c in tensors["coefficients"]]
-            return SymmetricVoxels(parts, Symmetry.from_entries(about["symmetry"])), box, n_ambient
-        shape = NetworkShape.of(about["network"])
-        symmetry = about.get("symmetry")
-        network = Network(shape) if symmetry is None else SymmetricNetwork(shape, Symmetry.from_entries(symmetry))
-        network.load_state_dict(tensors)
-        network.eval().requires_grad_(False)
-        return NeuralField(network, box, float(about["index_scale"]), float(about["offset"])), box, n_ambient
+        box = Box(tuple(lower), tuple(upper))
+        return _field_of(tensors, about, box), box, float(about["n_ambient"])
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         raise InputError(
             f"not a field of this version of nerif ({type(error).__name__}: {error})", field=path
         ) from None
+
+
+def _field_of(tensors: dict[str, Tensor], about: dict[str, Any], box: Box) -> Field:
+    """The field of tensors and the entries of its header."""
+    if about["kind"] == "sum":
+        whole = State(tensors, {})
+        parts = [_field_of(whole.under(f"{i}."), entries, box) for i, entries in enumerate(about["parts"])]
+        return SumField(*parts)
+    if about["kind"] == "voxels":
+        return VoxelField(tensors["coefficients"], Grid(box, tuple(about["shape"])), int(about["degree"]))
+    if about["kind"] == "symmetric voxels":
+        lower, upper = about["reduced_box"]
+        grid = Grid(Box(tuple(lower), tuple(upper)), tuple(about["shape"]))
+        planes = [VoxelField(c, grid, int(about["degree"])) for c in tensors["coefficients"]]
+        return SymmetricVoxels(planes, Symmetry.from_entries(about["symmetry"]))
+    shape = NetworkShape.of(about["network"])
+    symmetry = about.get("symmetry")
+    network = Network(shape) if symmetry is None else SymmetricNetwork(shape, Symmetry.from_entries(symmetry))
+    network.load_state_dict(tensors)
+    network.eval().requires_grad_(False)
+    return NeuralField(network, box, float(about["index_scale"]), float(about["offset"]))
 
 
 def read_quantity(directory: Path) -> str:

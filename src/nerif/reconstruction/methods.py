@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from nerif.reconstruction.base import Reconstructor
+from nerif.reconstruction.gaussian_process import GaussianProcess
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.voxels.landweber import Landweber
 from nerif.reconstruction.voxels.multiplicative import MART, MLEM
@@ -16,6 +17,7 @@ METHODS: dict[str, type[Reconstructor]] = {
     "tikhonov": Tikhonov,
     "landweber": Landweber,
     "tv": TotalVariation,
+    "gp": GaussianProcess,
     "mlem": MLEM,
     "mart": MART,
 }

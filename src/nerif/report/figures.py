@@ -12,7 +12,7 @@ from nerif.data.volume import Volume
 from nerif.geometry import Camera
 from nerif.plotting.drawing import COLOURS, label_of, plotted_quantities, plotted_values
 from nerif.reconstruction.rig.parameters import RefinedView
-from nerif.reconstruction.uncertainty.bootstrap import TAILS
+from nerif.reconstruction.uncertainty.deviations import TAILS
 from nerif.results.metrics import ViewScores
 
 if TYPE_CHECKING:

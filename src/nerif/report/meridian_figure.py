@@ -9,7 +9,7 @@ import numpy as np
 
 from nerif.data.meridian import Meridian
 from nerif.plotting.drawing import COLOURS, add_colour_bar, colour_range, label_of, map_colours
-from nerif.reconstruction.uncertainty.bootstrap import TAILS
+from nerif.reconstruction.uncertainty.deviations import TAILS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

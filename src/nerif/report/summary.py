@@ -130,8 +130,14 @@ def accuracy_rows(result: Result) -> Rows:
         quantity = spread.quantity.removesuffix("_std")
         rms = float(np.sqrt(np.nanmean(spread.values.double().numpy() ** 2)))
         name, unit = LABELS.get(quantity, (quantity, spread.unit))
-        title = f"Standard deviation, bootstrap of {metrics.uncertainty['trials']}"
+        source = metrics.uncertainty.get("source", "bootstrap")
+        samples = {"bootstrap": "bootstrap of", "posterior": "posterior draws:"}[source]
+        title = f"Standard deviation, {samples} {metrics.uncertainty['trials']}"
         rows.append((title, f"rms {with_unit(number(rms, 2), unit)} of {name}"))
+    if detail := metrics.detail:
+        residuals = f"residual {detail['residual_before']:.2f} σ without it, {detail['residual_after']:.2f} σ with it"
+        mean = "about the blurred field" if detail["blurred"] else "about the field"
+        rows.append(("Detail", f"{mean}, {detail['voxels']} voxels; {residuals}"))
     if coverage := metrics.coverage:
         text = f"{coverage['two_sigma']:.0%} of the voxels, {coverage['two_sigma_in_flow']:.0%} of those in the flow"
         rows.append(("Truth within ±2 σ", text))

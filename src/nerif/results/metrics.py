@@ -17,8 +17,8 @@ from nerif.common.files import write_json
 from nerif.reconstruction.rig.parameters import RefinedView
 
 __all__ = [
-    "VERSION", "AxisEstimate", "Coverage", "HalfAsymmetry", "Metrics", "PredictionAccuracy", "ResidualTest",
-    "SliceScores", "Uncertainty", "VerdictEntries", "ViewScores", "WithheldRun",
+    "VERSION", "AxisEstimate", "Coverage", "DetailEntries", "HalfAsymmetry", "Metrics", "PredictionAccuracy",
+    "ResidualTest", "SliceScores", "Uncertainty", "VerdictEntries", "ViewScores", "WithheldRun",
 ]  # fmt: skip
 
 VERSION = 1
@@ -115,12 +115,31 @@ class HalfAsymmetry(TypedDict):
 
 
 class Uncertainty(TypedDict):
-    """Bootstrap trials."""
+    """Bootstrap trials, or draws from the posterior."""
 
     kind: str
     trials: int
     diverged_trials: list[int]
     """Excluded ones."""
+    seconds: float
+    source: NotRequired[str]
+    """bootstrap, or posterior."""
+
+
+class DetailEntries(TypedDict):
+    """Detail added to the field of the method (reconstruction/detail.py)."""
+
+    residual_before: float
+    """Rms over sigma, without and with it."""
+    residual_after: float
+    withheld_before: Score
+    """The same of the withheld view in the cross-validation; NaN without one."""
+    withheld_after: Score
+    blurred: bool
+    """Whether it was added to the blurred field."""
+    voxels: int
+    """Along the longest edge of the box."""
+    iterations: int
     seconds: float
 
 
@@ -174,6 +193,8 @@ class Metrics:
     """Why it ended: converged, ..."""
     message: str | None = None
     cross_validation: WithheldRun | None = None
+
+    detail: DetailEntries | None = None
 
     views: list[ViewScores] = field(default_factory=list)
     reprojection: list[PredictionAccuracy] = field(default_factory=list)

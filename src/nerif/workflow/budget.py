@@ -58,12 +58,20 @@ class Budget:
         pixels = sum(c.image_size[0] * c.image_size[1] for c in measurement.cameras)
         return cls(limit, start, REPORT + PER_PIXEL * pixels + _sampling(reconstructor, measurement, voxels))
 
+    def holding(self, seconds: float) -> Budget:
+        """Return the budget with more time in reserve."""
+        return dataclasses.replace(self, reserve=self.reserve + seconds) if self.limit else self
+
+    @property
+    def left(self) -> float:
+        """Time until the limit, less the reserve; inf without a limit, s."""
+        return self.start + self.limit - self.reserve - time.time() if self.limit else math.inf
+
     def allot(self, reconstructor: R, share: float = 1.0) -> R:
         """Return settings with a share of the time that is left for fits; unchanged without a limit."""
         if not self.limit:
             return reconstructor
-        left = self.start + self.limit - self.reserve - time.time()
-        seconds = share * max(left, LEAST * self.limit)
+        seconds = share * max(self.left, LEAST * self.limit)
         return dataclasses.replace(reconstructor, time_limit=seconds)  # type: ignore[type-var]
 
 

@@ -126,6 +126,16 @@ class CrossValidation:
         return json.loads(path.read_text()) if path.is_file() else None
 
     @property
+    def withheld(self) -> Measurement:
+        """The data of the withheld view."""
+        return self.data.select([self.view])
+
+    @property
+    def training(self) -> Measurement:
+        """The data of the other views."""
+        return self.data.without([self.view])
+
+    @property
     def _directory(self) -> ResultDirectory:
         return self.out.cross_validation
 
@@ -133,6 +143,6 @@ class CrossValidation:
     def _run(self) -> CheckpointedRun:
         short, _ = self.reconstructor.in_two()
         return CheckpointedRun(
-            self._directory, short, self.data.without([self.view]), checkpoint_every=self.checkpoint_every,
+            self._directory, short, self.training, checkpoint_every=self.checkpoint_every,
             monitor=self.monitor, restart=self.restart, limits=LIMITS,
         )  # fmt: skip

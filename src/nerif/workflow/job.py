@@ -14,11 +14,12 @@ from nerif.analysis.prediction import check_sees
 from nerif.common.conventions import InputError
 from nerif.common.settings import check_settings
 from nerif.data.measurement import Measurement
-from nerif.data.volume import quantities_of
+from nerif.data.volume import Volume, quantities_of
 from nerif.fields.base import Field
 from nerif.physics.quantities import GasSettings
 from nerif.reconstruction.aperture import apply_aperture
 from nerif.reconstruction.base import OnStep, Reconstruction, Reconstructor, State, Step
+from nerif.reconstruction.detail import Choice, Posterior, check_sigma
 from nerif.reconstruction.files import CHECKPOINT, FIELD
 from nerif.reconstruction.methods import method_name
 from nerif.reconstruction.neural.neural import NeRIF
@@ -29,9 +30,9 @@ from nerif.reconstruction.shared_settings import SharedSettings
 from nerif.reconstruction.sources import check_source
 from nerif.reconstruction.symmetry import axis_of, with_axis
 from nerif.reconstruction.uncertainty.bootstrap import KINDS, Trials
-from nerif.reconstruction.voxels.settings import VoxelReconstructor
 from nerif.results.directory import ResultDirectory
 from nerif.results.live import Live
+from nerif.results.metrics import DetailEntries
 from nerif.workflow.budget import Budget
 from nerif.workflow.cross_validation import AUTO, MIN_VIEWS, CrossValidation, with_halves
 
@@ -51,8 +52,12 @@ class Run:
     """Result directory with the initial field: a reconstruction by any method in the same box."""
     fit_gains: bool = False
     """For emission: fit the intensity gain of each camera (not of withheld views)."""
+    detail: Literal["auto", "on", "off"] = "auto"
+    """Add detail that the field leaves in its data (docs/detail.md): on, off, or auto (for nerif and tv, where the
+    residual is above the noise and the withheld view of the cross-validation is predicted better with it)."""
     uncertainty: Literal[*KINDS] = "off"  # type: ignore[valid-type]
-    """Standard deviations of every quantity by bootstrap: off, fast (2 trials) or full (8 trials)."""
+    """Standard deviations of every quantity: off, fast (2 samples of the error) or full (8 samples); draws from the
+    posterior where detail is added, else bootstrap trials."""
     report: bool = True
     """Write report.html at the end."""
     checkpoint_every: float = 60.0
@@ -139,10 +144,17 @@ class Job:
     measurement, withheld : that predictions are compared with; those of the cross-validation if it was interrupted
     validation : the cross-validation, or None
     method, initial, state : settings of the main run, and the field or state it starts from
+    detail : how detail is to be added, if it is
     result : of the main run, once there is one
+    posterior, detail_entries : of the field, once detail has been added; for metrics.json
+    quantities : of the result, as volumes, once they are sampled
     """
 
+    detail: Choice | None = None
     result: Reconstruction | None = None
+    posterior: Posterior | None = None
+    detail_entries: DetailEntries | None = None
+    quantities: list[Volume]
 
     def __init__(
         self, out: ResultDirectory, measurement: Measurement | str | os.PathLike[str], reconstructor: Reconstructor,
@@ -153,7 +165,7 @@ class Job:
         self.out, self.resume, self.on_step = out, resume, on_step
         self.inputs, self.reconstructor = Inputs.of(measurement, reconstructor, run)
         if voxels is None:
-            voxels = reconstructor.voxels if isinstance(reconstructor, VoxelReconstructor) else VOXELS
+            voxels = getattr(reconstructor, "voxels", VOXELS)
         if voxels < 1:
             raise InputError(f"expected 1 or more, got {voxels}", field="voxels")
         self.voxels, self.trials = voxels, Trials(run.uncertainty)
@@ -163,6 +175,8 @@ class Job:
             monitor.say(line)
         pace = Pace(self.reconstructor, monitor.say)
         self.monitor = monitor.telling(pace)
+        if run.detail == "on":
+            check_sigma(self.inputs.training)
         self.validation = self._cross_validation()
         continued = self.validation is None or out.has(CHECKPOINT) or not self.validation.resumable
         self.state: State | None = out.state() if resume and continued else None

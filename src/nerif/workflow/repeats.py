@@ -15,17 +15,35 @@ from nerif.geometry import Grid
 from nerif.physics.quantities import GasSettings, derive_all, masked_lines
 from nerif.reconstruction.base import Reconstruction, Reconstructor
 from nerif.reconstruction.progress import QUIET, Monitor
-from nerif.reconstruction.uncertainty.bootstrap import Deviations, Maps, Original, Trials, certainty
+from nerif.reconstruction.uncertainty.bootstrap import BootstrapDeviations, Maps, Original, Trials
+from nerif.reconstruction.uncertainty.deviations import Deviations, certainty
 from nerif.results.directory import ResultDirectory
 from nerif.workflow.budget import NO_LIMIT, Budget
 from nerif.workflow.checkpointed import CheckpointedRun
 
-__all__ = ["Members", "all_quantities"]
+__all__ = ["Members", "all_quantities", "write_deviations"]
 
 
 def all_quantities(result: Reconstruction, gas: GasSettings, voxels: int) -> list[Volume]:
     """Sample a field and all derived quantities, `voxels` along the longest edge."""
     return derive_all(result.volume(Grid.of_resolution(result.box, voxels)), gas)
+
+
+def write_deviations(
+    out: ResultDirectory, monitor: Monitor, quantities: list[Volume], deviations: Deviations, entries: dict[str, Any]
+) -> None:
+    """Write the standard deviations of all quantities beside them, and the section of metrics.json."""
+    volumes = [*quantities, *deviations.volumes()]
+    std = next(v for v in volumes if v.quantity == f"{volumes[0].quantity}_std")
+    volumes.append(certainty(volumes[0], std))
+    out.write_volumes(volumes)
+    out.add_metrics(uncertainty={**entries, "trials": deviations.count})
+    for line in masked_lines(volumes):
+        monitor.say(line)
+    rms, largest = float(std.values.square().mean().sqrt()), float(volumes[0].values.abs().max())
+    size = f"rms standard deviation of {volumes[0].quantity} {rms:.3g}, {rms / largest:.2%} of the maximum"
+    samples = {"bootstrap": "trials", "posterior": "draws from the posterior"}[entries["source"]]
+    monitor.say(f"uncertainty from {deviations.count} {samples}: {size}")
 
 
 @dataclass(frozen=True)
@@ -55,16 +73,14 @@ class Members:
     monitor: Monitor = QUIET
     budget: Budget = NO_LIMIT
 
-    def add_to(self, main: Reconstruction, gas: GasSettings, voxels: int) -> None:
-        """Run the trials, and write standard deviations of every quantity beside the main result.
+    def add_to(self, main: Reconstruction, quantities: list[Volume], gas: GasSettings) -> None:
+        """Run the trials, and write standard deviations beside the quantities of the main result.
 
         Complete trials of an interrupted run are read; a diverged one is excluded.
         """
         say, start, word, count = self.monitor.say, time.monotonic(), "uncertainty", self.trials.members
         base = Original(main, self.reconstructor, self.training, lambda f: self._projections(f, main))
-        with self.monitor.counting("sampling the field"):
-            quantities = all_quantities(main, gas, voxels)
-        deviations = Deviations(quantities[0], gas.for_field(quantities[0]), base)
+        deviations = BootstrapDeviations(quantities[0], gas.for_field(quantities[0]), base)
         diverged = []
         for number in range(1, count + 1):
             member = self.trials.member(number, base)
@@ -81,24 +97,13 @@ class Members:
                 say(f"{word}: trial {number} {result.outcome.reason} and is excluded: {result.outcome.message}")
                 diverged.append(number)
                 continue
-            deviations.add(member, result)
+            deviations.add_trial(member, result)
         if not deviations.count:
             say(f"{word}: no trial succeeded, so no standard deviation is written")
             return
-        volumes = [*quantities, *deviations.volumes()]
-        std = next(v for v in volumes if v.quantity == f"{volumes[0].quantity}_std")
-        volumes.append(certainty(volumes[0], std))
-        self.out.write_volumes(volumes)
-        entries: dict[str, Any] = {
-            "kind": self.trials.kind, "trials": deviations.count, "diverged_trials": diverged,
-            "seconds": time.monotonic() - start,
-        }  # fmt: skip
-        self.out.add_metrics(uncertainty=entries)
-        for line in masked_lines(volumes):
-            say(line)
-        rms, largest = float(std.values.square().mean().sqrt()), float(volumes[0].values.abs().max())
-        size = f"rms standard deviation of {volumes[0].quantity} {rms:.3g}, {rms / largest:.2%} of the maximum"
-        say(f"{word} from {deviations.count} trials: {size}")
+        entries: dict[str, Any] = {"kind": self.trials.kind, "source": "bootstrap", "diverged_trials": diverged}
+        entries["seconds"] = time.monotonic() - start
+        write_deviations(self.out, self.monitor, quantities, deviations, entries)
 
     def _projections(self, field: Field, main: Reconstruction) -> Maps:
         with self.monitor.counting("projecting the field") as bar:

@@ -7,31 +7,39 @@ is read, the rest is written again.
 
 from __future__ import annotations
 
+import math
+import time
 from abc import ABC, abstractmethod
 from dataclasses import asdict, replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from nerif.analysis.asymmetry import asymmetry, asymmetry_sentence
 from nerif.analysis.evaluation import evaluate_views, score_lines
 from nerif.analysis.prediction import reproject
 from nerif.analysis.verdict import verdict
 from nerif.data.volume import quantities_of
+from nerif.geometry import Grid
 from nerif.imaging.calibration.cameras_file import CalibratedCamera, write_cameras
 from nerif.physics.quantities import NOT_UNIFORM, masked_lines
 from nerif.reconstruction.base import Reconstruction, compose
+from nerif.reconstruction.detail import COARSE, ITERATIONS, SIGNIFICANT, Choice, Detail, choose
 from nerif.reconstruction.files import FIELD, checkpoints
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.rig.parameters import refinement_lines, with_corrections
 from nerif.reconstruction.rig.posterior import with_posterior
 from nerif.reconstruction.rig.refinement import refit
-from nerif.reconstruction.shared_settings import SHORT_RUN
+from nerif.reconstruction.shared_settings import SHORT_RUN, SharedSettings
+from nerif.reconstruction.symmetry import axis_of
+from nerif.reconstruction.uncertainty.deviations import VOXELS, Deviations
 from nerif.results.directory import CALIBRATION, versions
 from nerif.results.metrics import Metrics
 from nerif.workflow.job import Job
-from nerif.workflow.repeats import Members, all_quantities
+from nerif.workflow.repeats import Members, all_quantities, write_deviations
 from nerif.workflow.reports import write_report
 
 __all__ = ["CLOSING", "STEPS", "PipelineStep"]
+
+MOST_DETAIL = 0.5  # of the time that is left
 
 
 class PipelineStep(ABC):
@@ -77,6 +85,44 @@ class CrossValidate(PipelineStep):
             job.measurement, job.withheld = job.validation.data, (job.validation.view,)
 
 
+class ChooseDetail(PipelineStep):
+    """Find out how detail is added, and whether it pays, from the cross-validation; hold back time for it."""
+
+    @staticmethod
+    def wanted(job: Job) -> bool:
+        wanted = job.run.detail == "on" or (job.run.detail == "auto" and job.reconstructor.detailed)
+        return wanted and job.result is None and all(o.sigma is not None for o in job.inputs.training.observations)
+
+    @staticmethod
+    def run(job: Job) -> None:
+        most = MOST_DETAIL * job.budget.left
+        choice = ChooseDetail.choice(job, most)
+        if choice is not None:
+            each = choice.seconds or (most if math.isfinite(most) else 0.0)
+            job.budget = job.budget.holding(min(each * (1 + job.trials.members), most))
+        job.detail = choice
+
+    @staticmethod
+    def choice(job: Job, most: float) -> Choice | None:
+        """Return how detail is added, or None; `most`: seconds that are left for it."""
+        validation, settings, on = job.validation, job.reconstructor, job.run.detail == "on"
+        assert isinstance(settings, SharedSettings)
+        if validation is None or not job.out.cross_validation.has(FIELD):
+            return Choice() if on or not job.budget.limit else None
+        axis = axis_of(settings, validation.training)
+        coarse = Detail(job.out.cross_validation.field()[0], validation.training, settings, axis, COARSE)
+        if coarse.residual < SIGNIFICANT and not on:
+            return None
+        with job.monitor.counting("choosing the detail") as bar:
+            choice = choose(coarse, validation.withheld, bar)
+        errors = f"{choice.before:.2f} sigma without it, {choice.after:.2f} with it"
+        job.monitor.say(f"detail: the withheld view is predicted to {errors}")
+        if choice.seconds > most and not on:
+            job.monitor.say(f"detail left out: it takes about {choice.seconds:.0f} s; give a longer --time-limit")
+            return None
+        return choice if choice.pays or on else None
+
+
 class Fit(PipelineStep):
     """Reconstruct the field from all views that are not withheld; resumes from checkpoint.safetensors."""
 
@@ -94,8 +140,42 @@ class Fit(PipelineStep):
             if job.on_step is not None:
                 callbacks.append(job.on_step)
             initial = job.initial if job.state is None else None
-            method = job.budget.allot(job.method, 1 / (1 + job.trials.members))
+            trials = 0 if job.detail is not None else job.trials.members
+            method = job.budget.allot(job.method, 1 / (1 + trials))
             job.result = method(job.inputs.training, compose(*callbacks), job.state, initial)
+
+
+class AddDetail(PipelineStep):
+    """Add the detail that the field leaves in its data; repeated when a run is resumed."""
+
+    sections = ("detail",)
+
+    @staticmethod
+    def wanted(job: Job) -> bool:
+        outcome = the_result(job).outcome
+        return job.detail is not None and not outcome.failed and outcome.reason != "interrupted"
+
+    @staticmethod
+    def run(job: Job) -> None:
+        result, choice, settings, begin = the_result(job), job.detail, job.reconstructor, time.monotonic()
+        assert choice is not None
+        assert isinstance(settings, SharedSettings)
+        data = with_corrections(job.inputs.training, result.rig)
+        coarse, fine = (Detail(result.field, data, settings, result.axis, size) for size in (COARSE, 1))
+        before = fine.residual
+        if before < SIGNIFICANT and job.run.detail == "auto":
+            job.monitor.say(f"detail left out: the residual is {before:.2f} sigma")
+            return
+        with job.monitor.counting("adding detail") as bar:
+            posterior = choice.solve(fine, coarse, lambda p: bar(p.count, ITERATIONS))
+        job.posterior, job.result = posterior, replace(result, field=posterior.field)
+        job.detail_entries = {
+            "residual_before": before, "residual_after": posterior.residual, "withheld_before": choice.before,
+            "withheld_after": choice.after, "blurred": choice.blurred, "voxels": max(fine.grid.shape),
+            "iterations": posterior.count, "seconds": time.monotonic() - begin,
+        }  # fmt: skip
+        residuals = f"from {before:.2f} to {posterior.residual:.2f} sigma"
+        job.monitor.say(f"detail on {max(fine.grid.shape)} voxels reduces the residual {residuals}")
 
 
 class WriteField(PipelineStep):
@@ -111,7 +191,7 @@ class WriteField(PipelineStep):
         out.write_history(result.history)
         say(f"{result.outcome.reason}: {result.outcome.message}")
         with job.monitor.counting("sampling the field"):
-            volumes = all_quantities(result, job.run.gas, job.voxels)
+            volumes = job.quantities = all_quantities(result, job.run.gas, job.voxels)
             out.write_volumes(volumes)
         for line in masked_lines(volumes):
             say(line)
@@ -123,7 +203,7 @@ class WriteField(PipelineStep):
                 measurement=job.settings["measurement"], seconds=result.seconds, device=result.device,
                 peak_memory_bytes=result.peak_memory_bytes, outcome=result.outcome.reason,
                 message=result.outcome.message,
-                cross_validation=None if job.validation is None else job.validation.scores(),
+                cross_validation=None if job.validation is None else job.validation.scores(), detail=job.detail_entries,
             )
         )  # fmt: skip
         about = {**versions(), "outcome": result.outcome.reason, "seconds": round(result.seconds, 3)}
@@ -202,14 +282,37 @@ class WriteAxis(PipelineStep):
             job.monitor.say(line)
 
 
-class Bootstrap(PipelineStep):
-    """Add standard deviations to the volumes; writes and resumes from trials/."""
+class DrawErrors(PipelineStep):
+    """Add standard deviations to the volumes, from draws of the posterior of the detail."""
 
     sections = ("uncertainty",)
 
     @staticmethod
     def wanted(job: Job) -> bool:
-        return bool(job.trials.members) and the_result(job).outcome.reason != "interrupted"
+        return bool(job.trials.members) and job.posterior is not None
+
+    @staticmethod
+    def run(job: Job) -> None:
+        assert job.posterior is not None
+        begin, deviations = time.monotonic(), Deviations(job.quantities[0], job.run.gas.for_field(job.quantities[0]))
+        grid = Grid.of_resolution(job.measurement.box, VOXELS)
+        for number in range(1, job.trials.members + 1):
+            with job.monitor.counting(f"draw {number} of {job.trials.members}") as bar:
+                deviations.add(job.posterior.error(number, bar).sample(grid), grid)
+        about: dict[str, Any] = {"kind": job.run.uncertainty, "source": "posterior", "diverged_trials": []}
+        about["seconds"] = time.monotonic() - begin
+        write_deviations(job.out, job.monitor, job.quantities, deviations, about)
+
+
+class Bootstrap(PipelineStep):
+    """Add standard deviations to the volumes, from trials; writes and resumes from trials/."""
+
+    sections = ("uncertainty",)
+
+    @staticmethod
+    def wanted(job: Job) -> bool:
+        interrupted = the_result(job).outcome.reason == "interrupted"
+        return bool(job.trials.members) and job.posterior is None and not interrupted
 
     @staticmethod
     def run(job: Job) -> None:
@@ -224,7 +327,7 @@ class Bootstrap(PipelineStep):
             job.out, job.trials, job.reconstructor, corrected, job.start, dependencies, job.run.checkpoint_every,
             monitor, job.budget,
         )  # fmt: skip
-        members.add_to(result, job.run.gas, job.voxels)
+        members.add_to(result, job.quantities, job.run.gas)
 
 
 class Judge(PipelineStep):
@@ -259,7 +362,7 @@ class WriteReport(PipelineStep):
 
 
 STEPS: tuple[type[PipelineStep], ...] = (
-    CrossValidate, Fit, WriteField, WriteRig, Reproject, WriteAxis, Bootstrap,
+    CrossValidate, ChooseDetail, Fit, AddDetail, WriteField, WriteRig, Reproject, WriteAxis, DrawErrors, Bootstrap,
 )  # fmt: skip
 CLOSING: tuple[type[PipelineStep], ...] = (Judge, WriteReport)
 """Run whatever became of the others, if there is a field."""

@@ -20,6 +20,7 @@ class NeRIF(TrainingSettings):
     """Neural refractive index field."""
 
     title: ClassVar[str] = "NeRIF"
+    detailed: ClassVar[bool] = True
 
     def __call__(
         self,

@@ -1,6 +1,6 @@
 """Bootstrap estimate of the error of a reconstruction, from trials on a known field: the reconstruction itself.
 
-    std(x) = rho exp(C sqrt(1 - k^2)) (G * mean_j (q'_j - q)^2)^(1/2) (x)
+    std(x) = factor (G * mean_j (q'_j - q)^2)^(1/2) (x),     factor = rho exp(C sqrt(1 - k^2))
     k^2 = <(q'_j - g * q'_j)^2> / <(q - g * q)^2>,    rho^2 = <(d - F q)^2> / <(d_j - F q'_j)^2>
 
 Trial q'_j is reconstructed from simulated projections of the field q in the same cameras, to which the residuals of the
@@ -13,7 +13,7 @@ the errors are due to noise; if not, q has lost more of the truth than the trial
 random flows (docs/decisions/055). If the reconstruction was trained longer than the trials, it fits its data d
 better than they fit theirs, d_j, and its errors are smaller by rho.
 
-A single error is noisy, so squares are averaged around each voxel by a Gaussian G. No truth is used.
+No truth is used. G: deviations.py.
 """
 
 from __future__ import annotations
@@ -32,23 +32,21 @@ from torch import Tensor
 
 from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
-from nerif.data.volume import Volume, describe
+from nerif.data.volume import Volume
 from nerif.fields.base import Field
 from nerif.fields.grid import VoxelField
 from nerif.geometry import Camera, Grid
-from nerif.physics.quantities import GasSettings, derive, deviation
+from nerif.physics.quantities import GasSettings
 from nerif.reconstruction.base import Reconstruction, Reconstructor
+from nerif.reconstruction.uncertainty.deviations import VOXELS, Deviations, blurred
 
-__all__ = ["KINDS", "VOXELS", "Deviations", "Maps", "Member", "Original", "Trials", "best_covered", "certainty"]
+__all__ = ["KINDS", "BootstrapDeviations", "Maps", "Member", "Original", "Trials", "best_covered"]
 
 KINDS = {"off": 0, "fast": 2, "full": 8}  # trials
-VOXELS = 64  # along the longest edge of the box, on which errors are compared
-WIDTH = 0.04  # of the box edge: standard deviation of G
 DETAIL_PX = 0.7  # in the middle of the box: standard deviation of g
 LOST = 1.9  # C
 MIN_DETAIL = 1e-10  # of the squares of a field: less is rounding
 BLOCK = 8  # px: edge of the blocks in which residuals keep their sign
-TAILS = {"p05": -1.645, "p95": 1.645}  # standard deviations of the percentiles
 
 Maps = Mapping[str, Float[Tensor, "view row column c"]]  # projections, or their noise, by the name of the technique
 
@@ -80,19 +78,6 @@ class Member:
     reconstructor: Reconstructor
     measurement: Measurement
     truth: Volume
-
-
-def certainty(field: Volume, std: Volume) -> Volume:
-    """Return q^2 / (q^2 + std^2), between 0 and 1; 0 where both are 0.
-
-    As the opacity of a volume it hides the ambient and fades what is uncertain.
-
-    Source: the gain of Wiener's filter, Extrapolation, Interpolation, and Smoothing of Stationary Time Series (1949).
-    """
-    signal, noise = field.values.double().square(), std.values.double().square()
-    values = torch.where(signal + noise > 0, signal / (signal + noise), 0.0).nan_to_num(0.0)
-    label = f"{field.quantity}_certainty"
-    return Volume(values.float(), field.grid, label, *describe(label)[:1], field.attributes)
 
 
 @dataclass(frozen=True)
@@ -158,38 +143,25 @@ def _residuals(measurement: Measurement, projections: Maps) -> list[float]:
     return squares
 
 
-def _blurred(values: Tensor, grid: Grid, mm: float) -> Tensor:
-    """The mean over a Gaussian with a standard deviation in mm, at least a voxel."""
-    from scipy.ndimage import gaussian_filter
+class BootstrapDeviations(Deviations):
+    """Standard deviations from the errors of trials.
 
-    width = [max(1.0, mm / h) for h in grid.spacing[::-1]]  # voxels along z, y, x
-    return torch.from_numpy(gaussian_filter(values.double().numpy(), width, mode="nearest"))
-
-
-class Deviations:
-    """Standard deviations of every quantity from the errors of trials.
-
-    `main` is the original field on the grid of the result.
+    `original` is the reconstruction that they repeat.
     """
 
     def __init__(self, main: Volume, gas: GasSettings, original: Original) -> None:
-        self.main, self.gas, self.original = main, gas, original
+        super().__init__(main, gas)
+        self.original = original
         self.pixel = mean(original.measurement.pixel_sizes)  # mm, in the middle of the box
-        self.squares: list[Tensor] = []
         self.detail: list[tuple[float, float]] = []  # mean square of a trial and of its truth, where that has any
         self.residual_ratios: list[float] = []  # mean square of a trial over that of the reconstruction
-        self.grid: Grid | None = None
 
-    @property
-    def count(self) -> int:
-        return len(self.squares)
-
-    def add(self, member: Member, result: Reconstruction) -> None:
+    def add_trial(self, member: Member, result: Reconstruction) -> None:
         """Add the error of a trial."""
-        self.grid = member.truth.grid
-        both = result.volume(self.grid).values.double(), member.truth.values.double()
-        self.squares.append((both[0] - both[1]).square())
-        fine = [float((v - _blurred(v, self.grid, DETAIL_PX * self.pixel)).square().mean()) for v in both]
+        grid = member.truth.grid
+        both = result.volume(grid).values.double(), member.truth.values.double()
+        self.add(both[0] - both[1], grid)
+        fine = [float((v - blurred(v, grid, DETAIL_PX * self.pixel)).square().mean()) for v in both]
         if fine[1] > MIN_DETAIL * float(both[1].square().mean()):
             self.detail.append((fine[0], fine[1]))
         residuals = _residuals(member.measurement, self.original.project(result.field))
@@ -213,41 +185,6 @@ class Deviations:
         ratios = self.residual_ratios
         return mean(ratios) ** -0.5 if ratios and mean(ratios) > 0 else 1.0
 
-    def local(self) -> Float[Tensor, "z y x"]:
-        """Return the rms error of the trials around each voxel of `grid`."""
-        assert self.grid is not None
-        edge = math.prod(self.grid.box.edges) ** (1 / 3)
-        return _blurred(torch.stack(self.squares).mean(dim=0), self.grid, WIDTH * edge).sqrt()
-
-    def std(self) -> Volume:
-        """Return the standard deviation of the field."""
-        assert self.grid is not None
-        values = self.better * math.exp(LOST * math.sqrt(self.lost)) * self.local()
-        values = VoxelField.through(values, self.grid).sample(self.main.grid).clamp(min=0)
-        return Volume(values, self.main.grid, f"{self.main.quantity}_std")
-
-    def volumes(self) -> list[Volume]:
-        """Return the standard deviation of every quantity, such as density_std; percentiles of the temperature T.
-
-        The percentiles of the field x are x + z std; those of T, which is not linear in x, are T(x + z std).
-        """
-        std = self.std().values.double()
-        volumes = []
-        for quantity in self.gas.quantities_of(self.main):
-            volumes.append(self._statistic(quantity, "std", deviation(self.main, std, quantity, self.gas)))
-            if quantity == "temperature":
-                for name, z in TAILS.items():
-                    values = self.main.values.double() - z * std  # temperature falls as the index rises
-                    n_ambient = float(self.main.attributes.get("n_ambient", 1.0))
-                    tail = Volume.of(values, self.main.grid, self.main.quantity, n_ambient)
-                    volumes.append(self._statistic(quantity, name, derive(tail, quantity, self.gas).values.double()))
-        return volumes
-
-    def _statistic(self, quantity: str, statistic: str, values: Tensor) -> Volume:
-        label = f"{quantity}_{statistic}"
-        derived = derive(self.main, quantity, self.gas)
-        notes: dict[str, float | str] = {"trials": self.count}
-        if "assumption" in derived.notes:
-            masked = {"masked_voxels": int(torch.isnan(values).sum()), "masked_where": derived.notes["masked_where"]}
-            notes |= {"assumption": derived.notes["assumption"], **masked}
-        return Volume(values.float(), self.main.grid, label, describe(label)[0], derived.attributes, notes)
+    @property
+    def factor(self) -> float:
+        return self.better * math.exp(LOST * math.sqrt(self.lost))

@@ -39,7 +39,7 @@ from nerif.reconstruction.rig.refinement import MOMENTUM, Refinement, load_rig, 
 from nerif.reconstruction.sources import of_source
 from nerif.reconstruction.symmetry import axis_of
 from nerif.reconstruction.target import Target
-from nerif.reconstruction.voxels.layout import InSpace, Layout, Symmetric
+from nerif.reconstruction.voxels.layout import layout_of
 from nerif.reconstruction.voxels.levels import Level, coarser, levels
 from nerif.reconstruction.voxels.problem import Iterate, Problem
 from nerif.reconstruction.voxels.weight import COARSE_WEIGHT, DISCREPANCY, choose_weight
@@ -83,11 +83,8 @@ class Descent:
         faces = ambient_faces(measurement, settings.ambient_faces)
         check_gauge(measurement, faces, settings.hull)
         self.axis = axis_of(settings, measurement)
-        common: dict[str, Any] = {
-            "box": measurement.box, "faces": faces, "basis": settings.basis, "step": settings.step,
-            "device": self.device, "dtype": getattr(torch, settings.precision),
-        }  # fmt: skip
-        self.layout: Layout = Symmetric(symmetry=self.axis.symmetry, **common) if self.axis else InSpace(**common)
+        dtype = getattr(torch, settings.precision)
+        self.layout = layout_of(measurement, self.axis, faces, settings.basis, settings.step, self.device, dtype)
         grids = self.layout.grids(settings.voxels, settings.coarse_to_fine)
         self.levels = levels(measurement, grids, settings.coarse_to_fine)
         finest = grids[-1]

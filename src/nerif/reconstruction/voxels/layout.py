@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -12,16 +13,16 @@ from torch import Tensor
 
 from nerif.data.measurement import Measurement
 from nerif.fields.base import Field
-from nerif.fields.grid import DEGREES, Boundary, VoxelField
+from nerif.fields.grid import DEGREES, Boundary, VoxelField, spline_coefficients
 from nerif.fields.symmetric import SymmetricVoxels
 from nerif.forward.base import ForwardModel
 from nerif.geometry import Box, Grid, Rays
-from nerif.geometry.symmetry import Symmetry
-from nerif.reconstruction.gauge import visual_hull
+from nerif.geometry.symmetry import Axis, Symmetry
+from nerif.reconstruction.gauge import ambient_faces, visual_hull
 from nerif.reconstruction.voxels.operator import VoxelOperator
 from nerif.reconstruction.voxels.symmetric_operator import SymmetricOperator
 
-__all__ = ["InSpace", "Layout", "Symmetric"]
+__all__ = ["InSpace", "Layout", "Symmetric", "layout_of"]
 
 MIN_FIRST_VOXELS = 12  # along the longest edge of the first grid
 MIN_HALVED_VOXELS = 4  # along an edge that is halved
@@ -60,6 +61,15 @@ class Layout(ABC):
     def sample(self, field: Field, grid: Grid) -> Float[Tensor, "z y x"]:
         """Return a field at the positions of the coefficients, as a first approximation of them."""
 
+    def coefficients(self, field: Field, grid: Grid) -> Float[Tensor, "z y x"]:
+        """Return the coefficients of the splines through the values of a field."""
+        return spline_coefficients(self.sample(field, grid), self.degree, self.boundary, self.splined_axes)
+
+    @property
+    def splined_axes(self) -> tuple[int, ...]:
+        """The axes of the coefficients along which the field is a spline."""
+        return (0, 1, 2)
+
     @abstractmethod
     def free(self, measurement: Measurement, grid: Grid) -> Bool[Tensor, "z y x"]:
         """Return the coefficients within the visual hull."""
@@ -72,6 +82,17 @@ class Layout(ABC):
             shape = [min(n, max(MIN_HALVED_VOXELS, n // 2)) for n in shape]
             grids.insert(0, Grid(last.box, (shape[0], shape[1], shape[2])))
         return grids
+
+
+def layout_of(
+    measurement: Measurement, axis: Axis | None, faces: tuple[str, ...] = (), basis: str = "cubic",
+    step: float | None = None, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32,
+) -> Layout:  # fmt: skip
+    """Return the layout for a measurement, with the ambient faces of the settings or else its own."""
+    faces = ambient_faces(measurement, faces)
+    common: dict[str, Any] = {"box": measurement.box, "faces": faces, "basis": basis, "step": step}
+    common |= {"device": device, "dtype": dtype}
+    return Symmetric(symmetry=axis.symmetry, **common) if axis else InSpace(**common)
 
 
 class InSpace(Layout):
@@ -104,6 +125,10 @@ class Symmetric(Layout):
     """Splines of (r, h), one for each azimuth of the symmetry."""
 
     symmetry: Symmetry
+
+    @property
+    def splined_axes(self) -> tuple[int, ...]:
+        return (0, 2)
 
     @property
     def boundary(self) -> Boundary:

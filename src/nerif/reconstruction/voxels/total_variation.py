@@ -32,6 +32,7 @@ class TotalVariation(WeightedVoxelReconstructor):
     """
 
     title: ClassVar[str] = "total variation"
+    detailed: ClassVar[bool] = True
     softness: float = 0.1
     """Gradient, in units of the field's own scale per box edge, below which the penalty is quadratic."""
     round: int = 10

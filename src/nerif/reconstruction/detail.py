@@ -1,0 +1,306 @@
+"""The detail that a reconstruction leaves in its data: the posterior mean of a Gaussian field around it.
+
+    x = m + a h
+
+h is a homogeneous field with the spectrum of von Karman (voxels/prior.py). m is the reconstruction q, or q blurred
+where its own detail is wrong. a is the local rms of grad q, as detail lies where the field varies, or in a second pass
+the local rms of a h from a solution on a coarse grid. Its size explains what the residual has above the noise.
+
+Blurred or not, and one pass or two: whichever predicts the withheld view of the cross-validation best (`choose`);
+without one, q is not blurred, and the second pass is made if its objective is lower.
+
+The voxels are smaller than the pixels: detail that they cannot represent would appear elsewhere, as artefacts
+(docs/decisions/057).
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerif.common.conventions import InputError
+from nerif.common.pauses import pause
+from nerif.data.measurement import Measurement
+from nerif.fields.base import Field
+from nerif.fields.sum import SumField
+from nerif.forward.path_integral import PathIntegral, project
+from nerif.forward.registry import AUTO, forward_models
+from nerif.geometry import Grid
+from nerif.geometry.symmetry import Axis
+from nerif.reconstruction.aperture import apply_aperture
+from nerif.reconstruction.bounds import field_bounds
+from nerif.reconstruction.device import resolve_device
+from nerif.reconstruction.shared_settings import SharedSettings
+from nerif.reconstruction.sources import of_source
+from nerif.reconstruction.target import Target
+from nerif.reconstruction.voxels.layout import layout_of
+from nerif.reconstruction.voxels.levels import bins_of, pixels_in_a_voxel
+from nerif.reconstruction.voxels.prior import Prior, WhiteProblem, von_karman
+from nerif.reconstruction.voxels.problem import Iterate, Problem
+from nerif.reconstruction.voxels.total_variation import gradient_square
+
+__all__ = ["Choice", "Detail", "Posterior", "check_sigma", "choose"]
+
+VOXEL = 0.7  # px: edge of a voxel in the middle of the box
+MOST_VOXELS = 160  # along the longest edge of the box
+COARSE = 2  # fine voxels, and pixels, in a coarse one
+OUTER_SCALE = 0.1  # L; this and the widths are shares of the longest edge of the box
+MEAN_WIDTH = 0.04  # standard deviation of the Gaussian that blurs the reconstruction
+SLOPE_WIDTH, DETAIL_WIDTH = 0.07, 0.04  # of the Gaussians for the local rms of grad q and of a h
+FLOOR = 0.05  # of the largest a
+ITERATIONS = 30
+"""Of conjugate gradients: more change the error by less than a hundredth of it (docs/decisions/057)."""
+SIGNIFICANT = 1.1  # sigma: residual above which there is detail
+BETTER = 0.99  # of the error of a prediction, at most
+FINE_COST = 10.0  # seconds on the fine grid over those on the coarse one
+
+Watch = Callable[["Posterior"], bool | None]
+"""Called after each iteration; returns True to stop."""
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """The posterior of a field given its data.
+
+    Parameters
+    ----------
+    detail : that was solved
+    problem : in white noise
+    iterate : towards the mean
+    count : of iterations
+    """
+
+    detail: Detail
+    problem: WhiteProblem
+    iterate: Iterate
+    count: int
+
+    @property
+    def coefficients(self) -> Float[Tensor, "z y x"]:
+        """The posterior mean, scaled."""
+        return self.problem.field(self.iterate.x)
+
+    @property
+    def residual(self) -> float:
+        """Rms residual over sigma."""
+        assert self.problem.target.noise is not None
+        return math.sqrt(self.iterate.residual / self.problem.target.noise)
+
+    @property
+    def objective(self) -> float:
+        return self.problem.objective(self.iterate)
+
+    @property
+    def field(self) -> SumField:
+        """The reconstruction plus the splines that make it the posterior mean."""
+        difference = self.coefficients * self.detail.problem.scale - self.detail.coefficients
+        return SumField(self.detail.base, self.detail.layout.field(difference.cpu(), self.detail.grid))
+
+    @property
+    def splines(self) -> Field:
+        """The posterior mean as splines alone."""
+        return self._splines(self.coefficients)
+
+    def error(self, seed: int, on_iteration: Callable[[int, int], None] = lambda done, total: None) -> Field:
+        """Return a draw of the error: the difference between a draw from the posterior and its mean."""
+        draw, draws = self.coefficients, self.problem.draw(torch.Generator().manual_seed(seed))
+        for i in range(ITERATIONS):
+            draw = next(draws)
+            on_iteration(i + 1, ITERATIONS)
+        return self._splines(draw - self.coefficients)
+
+    def _splines(self, coefficients: Float[Tensor, "z y x"]) -> Field:
+        scaled = coefficients * self.detail.problem.scale
+        return self.detail.layout.field(scaled.cpu(), self.detail.grid)
+
+
+class Detail:
+    """The data of a field's detail, and the voxels that hold it.
+
+    Parameters
+    ----------
+    field : reconstructed
+    measurement : with sigma
+    settings : of the reconstruction
+    axis : of a symmetric flow
+    coarse : fine voxels, and their bins of pixels, along an edge of one of the grid
+    voxels : along the longest edge of the box, on the fine grid; None for somewhat smaller ones than the pixels
+    """
+
+    def __init__(
+        self, field: Field, measurement: Measurement, settings: SharedSettings, axis: Axis | None = None,
+        coarse: int = 1, voxels: int | None = None,
+    ) -> None:  # fmt: skip
+        check_sigma(measurement)
+        measurement = apply_aperture(measurement, settings.aperture)
+        source = getattr(settings, "source", AUTO)
+        self.measurement = of_source(measurement, source, preferred="displacements")
+        self.base, self.settings, self.axis, self.coarse = field, settings, axis, coarse
+        self.device = resolve_device(settings.device)
+        self.layout = layout_of(self.measurement, axis, settings.ambient_faces, device=self.device)
+        fine = self.layout.grid(voxels or voxels_of(self.measurement))
+        self.bins = coarse * bins_of(self.measurement, fine, voxels=1.0)
+        self.grid = self.layout.grid(max(1, max(fine.shape) // coarse))
+
+    @cached_property
+    def problem(self) -> Problem:
+        """The linear problem of the whole field."""
+        target = self.target(self.measurement)
+        masked = getattr(self.settings, "hull", True) and self.measurement.flow_mask is not None
+        free = self.layout.free(self.measurement, self.grid) if masked else None
+        bounds = field_bounds(self.measurement, self.settings.lower, self.settings.upper)
+        limits = bounds if any(map(math.isfinite, bounds)) else None
+        operators = [self.layout.operator(part.rays, self.grid, part.model) for part in target.parts]
+        return Problem(operators, target, free, limits)
+
+    def target(self, measurement: Measurement) -> Target:
+        """Return data of a measurement, less the effect of the bending of rays."""
+        target = Target.of(measurement, self.settings.open_faces, self.bins, linear=True).to(self.device)
+        models = forward_models(measurement.techniques, measurement, getattr(self.settings, "model", AUTO))
+        parts = []
+        for part, model in zip(target.parts, models, strict=True):
+            if not model.straight:
+                splines = self.layout.field(self.coefficients.cpu(), self.grid)
+                bent, straight = (project(PathIntegral(m), splines, part.rays) for m in (model, model.linear_twin))
+                part = replace(part, offset=(bent - straight).to(part.measured))
+            parts.append(part)
+        return replace(target, parts=tuple(parts))
+
+    @cached_property
+    def coefficients(self) -> Float[Tensor, "z y x"]:
+        """Those of splines through the field, in its own unit."""
+        return self.layout.coefficients(self.base, self.grid).to(self.device)
+
+    def mean(self, blurred: bool) -> Float[Tensor, "z y x"]:
+        """Return the mean of the prior: the scaled coefficients of the field, or the same blurred."""
+        scaled = self.coefficients / self.problem.scale
+        return self.problem.pin(self._blurred(scaled, MEAN_WIDTH) if blurred else scaled)
+
+    def prior(self, size: Float[Tensor, "z y x"], width: float) -> Prior:
+        """Return the prior whose deviation is proportional to the local rms of a field, over a width."""
+        deviation = self._blurred(size.square(), width).sqrt() if width else size.abs()
+        deviation = self.problem.pin(deviation.clamp_min(FLOOR * float(deviation.max())))
+        spectrum = von_karman(self.grid, OUTER_SCALE * max(self.grid.box.edges))
+        return Prior(deviation, spectrum.to(deviation))
+
+    def first(self, blurred: bool) -> WhiteProblem:
+        """Return the problem whose prior follows the gradient of the field."""
+        scaled = self.coefficients / self.problem.scale
+        slope = gradient_square(self.problem.differences(scaled)).sqrt()
+        return WhiteProblem(self.problem, self.prior(slope, SLOPE_WIDTH), self.mean(blurred)).fits()
+
+    def next(self, posterior: Posterior) -> WhiteProblem:
+        """Return the problem whose prior follows the detail of a solution."""
+        detail = posterior.problem.prior(posterior.iterate.x)
+        return WhiteProblem(self.problem, self.prior(detail, DETAIL_WIDTH), posterior.problem.mean).fits()
+
+    def like(self, problem: WhiteProblem, blurred: bool) -> WhiteProblem:
+        """Return the problem with the prior of one on another grid."""
+        there = Grid(self.grid.box, problem.operator.domain_shape)
+        deviation = self.layout.sample(self.layout.field(problem.prior.deviation.cpu(), there), self.grid)
+        prior = self.prior(deviation.to(self.coefficients), 0.0)
+        return WhiteProblem(self.problem, prior, self.mean(blurred)).fits()
+
+    @property
+    def residual(self) -> float:
+        """Rms residual of the field over sigma."""
+        assert self.problem.noise is not None
+        return math.sqrt(self.problem.residual(self.mean(blurred=False)) / self.problem.noise)
+
+    def solve(self, problem: WhiteProblem, watch: Watch | None = None, iterations: int = ITERATIONS) -> Posterior:
+        """Return the posterior after some iterations of conjugate gradients."""
+        for i, iterate in zip(range(iterations), problem.solve(), strict=False):
+            pause()
+            posterior = Posterior(self, problem, iterate, i + 1)
+            if watch is not None and watch(posterior):
+                break
+        return posterior
+
+    def others(self, measurement: Measurement) -> Target:
+        """Return the data of other views, as those of this one."""
+        measurement = apply_aperture(measurement, self.settings.aperture)
+        return self.target(of_source(measurement, getattr(self.settings, "source", AUTO), preferred="displacements"))
+
+    def prediction_error(self, target: Target, coefficients: Float[Tensor, "z y x"]) -> float:
+        """Return the rms residual of other views over sigma."""
+        squares = [part.residual(self.problem.predict(part, part.rays, coefficients)) for part in target.parts]
+        total = sum(float(r.square().sum()) for r in squares)
+        return math.sqrt(total * target.chi_square / target.numbers)
+
+    def _blurred(self, values: Float[Tensor, "z y x"], width: float) -> Float[Tensor, "z y x"]:
+        from scipy.ndimage import gaussian_filter
+
+        mm = width * max(self.measurement.box.edges)
+        voxels = [mm / h if n > 1 else 0.0 for n, h in zip(values.shape, self.grid.spacing[::-1], strict=True)]
+        return torch.from_numpy(gaussian_filter(values.cpu().numpy(), voxels, mode="nearest")).to(values)
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Which mean and prior predict a withheld view best.
+
+    Parameters
+    ----------
+    blurred : whether the mean is the blurred reconstruction
+    passes : 1 or 2; None: two, if the objective is lower then
+    before, after : rms residual of the withheld view over sigma, without and with detail; NaN without such a view
+    seconds : that the detail is expected to take
+    """
+
+    blurred: bool = False
+    passes: int | None = None
+    before: float = math.nan
+    after: float = math.nan
+    seconds: float = 0.0
+
+    @property
+    def pays(self) -> bool:
+        """Whether the withheld view is predicted better with detail."""
+        return not self.after > BETTER * self.before
+
+    def solve(self, fine: Detail, coarse: Detail, watch: Watch | None = None) -> Posterior:
+        """Return the posterior on the fine grid."""
+        problem = None
+        if self.passes != 1:
+            first = coarse.solve(coarse.first(self.blurred))
+            second = coarse.solve(coarse.next(first))
+            if self.passes or second.objective < first.objective:
+                problem = fine.like(second.problem, self.blurred)
+        return fine.solve(problem or fine.first(self.blurred), watch)
+
+
+def choose(
+    coarse: Detail, withheld: Measurement, on_done: Callable[[int, int], None] = lambda done, total: None
+) -> Choice:
+    """Return which mean and prior predict the withheld views of a field best, on a coarse grid."""
+    target = coarse.others(withheld)
+    best = Choice(before=coarse.prediction_error(target, coarse.mean(blurred=False)), after=math.inf)
+    start = time.perf_counter()
+    for i, blurred in enumerate((False, True)):
+        first = coarse.solve(coarse.first(blurred))
+        for passes, posterior in ((1, first), (2, coarse.solve(coarse.next(first)))):
+            error = coarse.prediction_error(target, posterior.coefficients)
+            if error < best.after:
+                best = replace(best, blurred=blurred, passes=passes, after=error)
+            on_done(2 * i + passes, 4)
+    return replace(best, seconds=FINE_COST * (time.perf_counter() - start) / 4)
+
+
+def check_sigma(measurement: Measurement) -> None:
+    """Raise InputError for data without sigma: what is above the noise is not known without it."""
+    for o in measurement.observations:
+        if o.sigma is None:
+            raise InputError(f"expected a measurement with {o.technique.sigma}, got none", field="measurement")
+
+
+def voxels_of(measurement: Measurement) -> int:
+    """Return the voxels along the longest edge of the box that are somewhat smaller than the pixels, at most MOST."""
+    pixels = pixels_in_a_voxel(measurement, Grid.of_resolution(measurement.box, MOST_VOXELS)) * MOST_VOXELS
+    return max(COARSE * 8, min(MOST_VOXELS, round(pixels / VOXEL)))

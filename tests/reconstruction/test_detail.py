@@ -1,0 +1,238 @@
+"""The detail that a field leaves: errors on flows that it did not draw, kinds of data, refusals."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from scipy.ndimage import gaussian_filter
+
+from nerif.data.measurement import Measurement
+from nerif.fields.grid import VoxelField
+from nerif.fields.phantoms import make_phantom
+from nerif.fields.sum import SumField
+from nerif.fields.symmetric import SymmetricVoxels
+from nerif.fields.turbulence import TurbulentPlume
+from nerif.forward.absorption import Absorption
+from nerif.geometry import Box, Grid, Ring, paper_rig
+from nerif.reconstruction.detail import COARSE, Choice, Detail, choose, voxels_of
+from nerif.reconstruction.gauge import visual_hull
+from nerif.reconstruction.gaussian_process import GaussianProcess
+from nerif.reconstruction.neural.neural import NeRIF
+from nerif.reconstruction.symmetry import axis_of
+from nerif.reconstruction.voxels.tikhonov import Tikhonov
+from nerif.reconstruction.voxels.total_variation import TotalVariation
+from nerif.simulation.simulate import simulate
+from refusals import refused
+
+BOX = Box.around_origin((40.0, 36.0, 30.0))
+N = 1.00027
+GRID = Grid.of_resolution(BOX, 40)
+SETTINGS = NeRIF(device="cpu")
+
+
+def seen(field, views=7, pixels=36, noise=0.05, f_number=0.0, seed=1):
+    """What a ring of cameras sees of a field."""
+    arc = (0.0, 180.0 * (1 - 1 / views))
+    ring = Ring(views=views, arc=arc, image_size=(pixels, pixels), pixel_pitch=4.0 / pixels)
+    return simulate(field, ring.cameras(f_number), BOX, N, noise, seed=seed, steps=50)
+
+
+def error(field, truth):
+    """Error over the variation of the truth."""
+    values = truth.sample(GRID)
+    return float((field.sample(GRID) - values).norm() / (values - values.mean()).norm())
+
+
+def smoothed(truth, mm):
+    """A reconstruction that has lost the detail of the truth."""
+    values = gaussian_filter(truth.sample(GRID).numpy(), [mm / h for h in GRID.spacing[::-1]])
+    return VoxelField.through(torch.from_numpy(values), GRID)
+
+
+@pytest.fixture(scope="module")
+def plume():
+    """A turbulent plume, with detail down to two pixels of its views, and these."""
+    truth = TurbulentPlume(BOX, seed=7, shortest=0.07)
+    return truth, seen(truth)
+
+
+@pytest.fixture(scope="module")
+def posterior(plume):
+    truth, measurement = plume
+    base = smoothed(truth, 1.5)
+    details = [Detail(base, measurement, SETTINGS, coarse=size) for size in (1, COARSE)]
+    return Choice(passes=1).solve(*details)
+
+
+def test_voxels_are_smaller_than_pixels(plume):
+    measurement = plume[1]
+    pixels = [camera.pixel_size(torch.zeros(3, dtype=torch.float64)) for camera in measurement.cameras]
+    edge = max(BOX.edges) / voxels_of(measurement)
+    assert 0.6 < edge / float(min(pixels)) < 0.8
+    assert voxels_of(seen(plume[0], views=2, pixels=300)) == 160
+
+
+def test_detail_reduces_residual_and_error_of_a_flow(plume, posterior):
+    truth, measurement = plume
+    base = posterior.detail.base
+    assert posterior.detail.residual > 3
+    assert posterior.residual < 0.5 * posterior.detail.residual
+    assert error(posterior.field, truth) < 0.8 * error(base, truth)
+    assert error(posterior.splines, truth) == pytest.approx(error(posterior.field, truth), rel=0.05)
+    assert isinstance(posterior.field, SumField)
+    assert posterior.field.parts[0] is base
+    assert measurement.displacement is not None
+
+
+def test_the_withheld_view_says_whether_to_blur(plume):
+    truth, measurement = plume
+    training, withheld = measurement.without(["0deg"]), measurement.select(["0deg"])
+    right = choose(Detail(smoothed(truth, 1.0), training, SETTINGS, coarse=COARSE), withheld)
+    assert right.pays
+    assert not right.blurred
+    generator = torch.Generator().manual_seed(1)  # a field whose own detail is wrong
+    wrong = gaussian_filter(torch.randn(GRID.shape, generator=generator).numpy(), 1.0)
+    values = smoothed(truth, 1.5).sample(GRID)
+    spoilt = values * (1 + 1.0 * torch.from_numpy(wrong) / wrong.std())
+    choice = choose(Detail(VoxelField.through(spoilt, GRID), training, SETTINGS, coarse=COARSE), withheld)
+    assert choice.blurred
+    assert choice.pays
+    assert choice.after < choice.before
+    assert choice.seconds > 0
+
+
+def test_detail_does_not_pay_where_there_is_only_noise():
+    truth = smoothed(make_phantom("gaussians", BOX, 2), 3.0)
+    measurement = seen(truth)
+    training, withheld = measurement.without(["0deg"]), measurement.select(["0deg"])
+    detail = Detail(truth, training, SETTINGS, coarse=COARSE)
+    assert Detail(truth, training, SETTINGS).residual == pytest.approx(1.0, abs=0.1)
+    assert not choose(detail, withheld).pays
+
+
+@pytest.mark.parametrize("seed", [3, pytest.param(4, marks=pytest.mark.slow)])
+def test_errors_are_drawn_as_large_as_they_are(posterior, plume, seed):
+    truth = plume[0]
+    drawn = torch.stack([posterior.error(seed + 10 * i).sample(GRID) for i in range(2)])
+    actual = posterior.field.sample(GRID) - truth.sample(GRID)
+    flow = truth.sample(GRID).abs() > 0.02 * truth.sample(GRID).abs().max()
+    ratio = float(drawn[:, flow].square().mean().sqrt() / actual[flow].square().mean().sqrt())
+    assert 0.6 < ratio < 1.6
+
+
+def test_a_flow_through_lenses():
+    truth = TurbulentPlume(BOX, seed=9, shortest=0.07)
+    measurement = seen(truth, views=5, pixels=24, f_number=8.0)
+    base = smoothed(truth, 1.5)
+    detail = Detail(base, measurement, SETTINGS)
+    posterior = detail.solve(detail.first(False), iterations=12)
+    assert posterior.residual < 0.7 * detail.residual
+    assert error(posterior.field, truth) < error(base, truth)
+
+
+def test_outside_the_masks_nothing_is_added(plume):
+    truth, measurement = plume
+    mask = torch.zeros_like(measurement.usable)
+    mask[:, 6:-6, 6:-6] = True
+    masked = replace(measurement, flow_mask=mask)
+    detail = Detail(smoothed(truth, 1.5), masked, SETTINGS)
+    posterior = detail.solve(detail.first(True), iterations=3)
+    outside = ~visual_hull(masked, detail.grid)
+    assert bool(outside.any())
+    assert not posterior.coefficients[outside].any()
+    assert bool(posterior.coefficients[~outside].any())
+
+
+def test_bounds_hold(plume):
+    truth, measurement = plume
+    detail = Detail(smoothed(truth, 1.5), measurement, replace(SETTINGS, upper=0.0))
+    posterior = detail.solve(detail.first(False), iterations=5)
+    assert float(posterior.coefficients.max()) <= 0
+
+
+def test_a_symmetric_flow_keeps_its_symmetry():
+    cameras, box = paper_rig(40)
+    truth = make_phantom("underexpanded", box, 0)
+    measurement = simulate(truth, cameras[:1], box, N, 0.02, 0)
+    settings = Tikhonov(voxels=20, symmetry="axis", axis_sigma_mm=0.0, axis_sigma_deg=0.0, device="cpu")
+    result = settings(measurement)
+    detail = Detail(result.field, measurement, settings, axis_of(settings, measurement))
+    posterior = detail.solve(detail.first(False))
+    assert isinstance(posterior.splines, SymmetricVoxels)
+    assert posterior.residual < 0.8 * detail.residual
+    grid = Grid.of_resolution(box, 48)
+    errors = [float((f.sample(grid) - truth.sample(grid)).norm()) for f in (result.field, posterior.field)]
+    assert errors[1] < errors[0]
+
+
+def test_absorption(box):
+    truth = make_phantom("gaussians", box, 1)
+    scaled = VoxelField.through(truth.sample(Grid.of_resolution(box, 30)) / -2e-4 * 0.05, Grid.of_resolution(box, 30))
+    ring = Ring(views=5, arc=(0.0, 144.0), image_size=(20, 26), pixel_pitch=0.11)
+    measurement = simulate(scaled, ring.cameras(), box, N, 0.02, seed=5, techniques=[Absorption])
+    base = VoxelField.through(0.8 * scaled.sample(Grid.of_resolution(box, 30)), Grid.of_resolution(box, 30))
+    detail = Detail(base, measurement, SETTINGS)
+    posterior = detail.solve(detail.first(False))
+    assert posterior.residual < 0.3 * detail.residual
+    assert float(posterior.splines.sample(detail.grid).min()) > -1e-3 * float(scaled.sample(detail.grid).max())
+
+
+def test_rays_that_bend():
+    balls = make_phantom("gaussians", BOX, 1)
+    truth = VoxelField.through(60 * balls.sample(GRID), GRID)  # strong, as a flow in water
+    measurement = seen(truth, views=4, pixels=36, noise=0.01)
+    residual = {m: Detail(truth, measurement, replace(SETTINGS, model=m)).residual for m in ("auto", "curved")}
+    assert residual["curved"] < 0.8 * residual["auto"]
+
+
+def test_a_measurement_without_sigma_is_refused(plume):
+    truth, measurement = plume
+    with refused("measurement"):
+        Detail(smoothed(truth, 1.5), replace(measurement, sigma=None), SETTINGS)
+    with refused("measurement"):
+        GaussianProcess()(replace(measurement, sigma=None))
+
+
+def test_the_gaussian_process_beats_tikhonov_on_turbulence(plume):
+    truth, measurement = plume
+    steps = []
+    result = GaussianProcess(voxels=48, device="cpu")(measurement, steps.append)
+    assert result.outcome.reason == "iterations"
+    assert error(result.field, truth) < 0.85 * error(Tikhonov(voxels=48, device="cpu")(measurement).field, truth)
+    assert steps[-1].step == len(steps) == len(result.history)
+    assert steps[-1].progress == pytest.approx(1.0)
+    assert [s.seconds for s in steps] == sorted(s.seconds for s in steps)
+    again = GaussianProcess(voxels=48, device="cpu")(measurement, resume=steps[-1].capture())
+    torch.testing.assert_close(again.field.sample(GRID), result.field.sample(GRID), rtol=0, atol=1e-9)
+
+
+def test_the_gaussian_process_stops_on_request_and_at_its_limit(plume):
+    measurement = plume[1]
+    last = []
+
+    def stop(step):
+        last.append(step)
+        return "residual_over_sigma" in step.losses and step.losses["voxels"] == 20
+
+    small = GaussianProcess(voxels=40, device="cpu")
+    stopped = small(measurement, stop)
+    assert stopped.outcome.reason == "interrupted"
+    assert stopped.history[-1]["voxels"] == 20
+    limited = replace(small, time_limit=1e-3)(measurement)
+    assert limited.outcome.reason == "time_limit"
+    assert math.isfinite(float(limited.field.sample(GRID).sum()))
+    short, whole = small.in_two()
+    assert (short.voxels, whole) == (20, small)
+
+
+def test_total_variation_leaves_detail_too(plume):
+    truth, measurement = plume
+    assert isinstance(measurement, Measurement)
+    result = TotalVariation(voxels=24, device="cpu")(measurement)
+    details = [Detail(result.field, measurement, TotalVariation(device="cpu"), coarse=size) for size in (1, COARSE)]
+    posterior = Choice().solve(*details)
+    assert posterior.residual < 0.7 * details[0].residual
+    assert error(posterior.field, truth) < error(result.field, truth)
