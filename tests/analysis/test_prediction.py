@@ -46,7 +46,7 @@ def test_sampled_views_and_their_accuracy(empty, model, monkeypatch):
     ball = GaussianBalls(centre.double(), width.double(), depth.double())
     forward, crosses = PathIntegral(MODELS[model](empty.n_ambient), prediction.SAMPLES), empty.sees_box
     exact = reproject(ball, empty, model=model).predicted[crosses]
-    views = SampledViews(ball, on_voxels(ball, BOX), BOX, forward)
+    views = SampledViews(ball, (on_voxels(ball, BOX),), BOX, forward)
     sampled = torch.stack([views(camera) for camera in empty.cameras])
     error = rms(sampled[crosses] - exact)
     assert error < 0.03 * rms(exact)

@@ -7,7 +7,7 @@ where its own detail is wrong. a is the local rms of grad q, as detail lies wher
 the local rms of a h from a solution on a coarse grid. Its size explains what the residual has above the noise.
 
 Blurred or not, and one pass or two: whichever predicts the withheld view of the cross-validation best (`choose`);
-without one, q is not blurred, and the second pass is made if its objective is lower.
+without one (`--detail on`), q is not blurred, and the second pass is made if its objective is lower.
 
 The voxels are smaller than the pixels: detail that they cannot represent would appear elsewhere, as artefacts
 (docs/decisions/057).

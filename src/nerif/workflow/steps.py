@@ -108,7 +108,7 @@ class ChooseDetail(PipelineStep):
         validation, settings, on = job.validation, job.reconstructor, job.run.detail == "on"
         assert isinstance(settings, SharedSettings)
         if validation is None or not job.out.cross_validation.has(FIELD):
-            return Choice() if on or not job.budget.limit else None
+            return Choice() if on else None
         axis = axis_of(settings, validation.training)
         coarse = Detail(job.out.cross_validation.field()[0], validation.training, settings, axis, COARSE)
         if coarse.residual < SIGNIFICANT and not on:
@@ -168,14 +168,15 @@ class AddDetail(PipelineStep):
             return
         with job.monitor.counting("adding detail") as bar:
             posterior = choice.solve(fine, coarse, lambda p: bar(p.count, ITERATIONS))
-        job.posterior, job.result = posterior, replace(result, field=posterior.field)
+        job.posterior = posterior
         job.detail_entries = {
             "residual_before": before, "residual_after": posterior.residual, "withheld_before": choice.before,
             "withheld_after": choice.after, "blurred": choice.blurred, "voxels": max(fine.grid.shape),
             "iterations": posterior.count, "seconds": time.monotonic() - begin,
         }  # fmt: skip
-        residuals = f"from {before:.2f} to {posterior.residual:.2f} sigma"
-        job.monitor.say(f"detail on {max(fine.grid.shape)} voxels reduces the residual {residuals}")
+        text = f"detail on {max(fine.grid.shape)} voxels, residual {before:.2f} to {posterior.residual:.2f} sigma"
+        outcome = replace(result.outcome, message=f"{result.outcome.message}; then {text}")
+        job.result = replace(result, field=posterior.field.to("cpu"), outcome=outcome)
 
 
 class WriteField(PipelineStep):

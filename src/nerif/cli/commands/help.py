@@ -16,7 +16,7 @@ WIDTH, INDENT = 100, 26
 
 GROUPS: dict[str, tuple[str, ...]] = {
     "data": ("source", "withhold", "open_faces", "lower", "upper", "start_from"),
-    "method": ("method", "preset", "symmetry", "refine", "detail", "seed", "device"),
+    "method": ("method", "preset", "symmetry", "refine", "seed", "device"),
     "limits": ("time_limit", "max_steps", "iterations"),
     "outputs": ("out", "voxels", "report", "force", "resume"),
     "uncertainty": ("uncertainty",),

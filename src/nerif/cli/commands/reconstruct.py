@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import inspect
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -23,7 +24,6 @@ from nerif.reconstruction.base import OnStep, Reconstruction, Reconstructor, Ste
 from nerif.reconstruction.methods import METHODS
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.neural.presets import PRESETS, preset
-from nerif.reconstruction.voxels.settings import VoxelReconstructor
 from nerif.results.directory import RUN
 from nerif.workflow.job import Run
 from nerif.workflow.pipeline import reconstruct_into
@@ -82,7 +82,8 @@ def command_of(method: str) -> type[Reconstruct]:
 
 @cache
 def _command(method: str, kind: type[Reconstructor]) -> type[Reconstruct]:
-    common = Reconstruct if issubclass(kind, VoxelReconstructor) else ReconstructGridless
+    with_voxels = any(f.name == "voxels" for f in dataclasses.fields(kind))  # type: ignore[arg-type]
+    common = Reconstruct if with_voxels else ReconstructGridless
     namespace = {
         "__module__": __name__,
         "__doc__": f"{inspect.getdoc(Reconstruct)}\n\n{kind.about()}",
