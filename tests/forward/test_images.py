@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import threading
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from nerif.analysis.prediction import predict, reproject
 from nerif.cli.cli import main
 from nerif.data.measurement import Measurement
 from nerif.data.volume import Volume
+from nerif.fields.grid import VoxelField
 from nerif.fields.network import NetworkShape
 from nerif.fields.phantoms import GaussianBalls
 from nerif.forward.deflection import LeverArm
@@ -24,6 +26,7 @@ from nerif.forward.images import Images, References
 from nerif.forward.interferometry import Interferometry
 from nerif.forward.registry import forward_model
 from nerif.geometry import Box, Grid, Ring
+from nerif.reconstruction.detail import Detail
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.neural.trainer import Trainer
 from nerif.reconstruction.neural.training_data import TrainingData
@@ -224,6 +227,16 @@ def test_networks_and_voxels_find_the_field_in_images(balls, taken):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("kind", ["taken", "both"])
+def test_detail_is_added_from_images_and_from_their_displacements(balls, kind, request):
+    measurement, grid = request.getfixturevalue(kind), Grid.of_resolution(BOX, 30)
+    weak = VoxelField.through(0.7 * balls.sample(grid), grid)
+    detail = Detail(weak, measurement, NeRIF(device="cpu"))
+    posterior = detail.solve(detail.first(blurred=False))
+    assert posterior.residual < 0.5 * detail.residual
+    assert error(balls, SimpleNamespace(field=posterior.field)) < 0.5 * error(balls, SimpleNamespace(field=weak))
+
+
 def test_a_drift_of_the_light_is_fitted(balls):
     assert error(balls, NETWORK(photographed(balls, gain=0.05))) < 0.16
 

@@ -1,0 +1,93 @@
+"""Detail: turbulent and smooth flows with and without it, by the Gaussian process, and by total variation.
+
+Whole runs of the pipeline, from measurement to result directory: 9 views of 100² px in 90 s (6 and 18 views of the
+turbulent flows, too) and of 200² px in 180 s; NeRIF with `--detail off` and `auto`, whose times are equal, and `gp` and
+`tv`, which end by themselves. Residuals are those of the re-projected training views over sigma, rms.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal
+
+from benchmarks.goals import simulated
+from benchmarks.runner import N_AMBIENT, Settings
+from nerif.analysis.evaluation import evaluate_volume
+from nerif.data.measurement import Measurement
+from nerif.data.volume import Volume
+from nerif.data.volume_file import read_volume, write_netcdf
+from nerif.fields.phantoms import make_phantom
+from nerif.geometry import Box, Grid, Ring
+from nerif.reconstruction.base import Reconstructor
+from nerif.reconstruction.gaussian_process import GaussianProcess
+from nerif.reconstruction.neural.presets import preset
+from nerif.reconstruction.voxels.total_variation import TotalVariation
+from nerif.results.directory import ResultDirectory
+from nerif.simulation.simulate import simulate
+from nerif.workflow.job import Run
+from nerif.workflow.pipeline import reconstruct_into
+
+COLUMNS = {
+    "phantom": "{phantom}", "views": "{views}", "pixels": "{pixels}²", "method": "{method}", "detail": "{detail}",
+    "L2": "{l2:.2%}", "of variation": "{l2_variation:.2%}", "residual": "{residual:.2f}", "seconds": "{seconds:.0f}",
+    "added": "{added}",
+}  # fmt: skip
+METHODS = (("nerif", "off"), ("nerif", "auto"), ("gp", "off"), ("tv", "off"))
+LIMITS = {16: 6.0, 100: 90.0, 200: 180.0}
+"""Time limit of NeRIF by the pixels along an image, s."""
+
+
+def cases(quick: bool) -> Iterator[Settings]:
+    flows = [("turbulence", 6, 16)]
+    if not quick:
+        flows = [(phantom, views, 100) for phantom in ("turbulence", "fire") for views in (6, 9, 18)]
+        flows += [(phantom, 9, 100) for phantom in ("flame", "gaussians", "octahedron")]
+        flows += [(phantom, 9, 200) for phantom in ("turbulence", "fire", "flame", "gaussians", "octahedron")]
+    for phantom, views, pixels in flows:
+        for seed in (0,) if quick else (0, 1, 2):
+            for method, detail in METHODS:
+                case = {"phantom": phantom, "views": views, "pixels": pixels, "method": method, "detail": detail}
+                yield {**case, "limit": LIMITS[pixels], "noise": 0.05, "seed": seed}
+
+
+def measured(folder: Path, phantom: str, views: int, pixels: int, noise: float, seed: int) -> tuple[Path, Path]:
+    """Return the files of measurement and truth, simulated once."""
+    if (views, pixels) == (9, 200):
+        return simulated(folder, phantom, pixels, noise, 100, seed)
+    name = f"detail-{phantom}-{views}-{pixels}-{noise:g}-{seed}"
+    data, truth = folder / f"{name}.nc", folder / f"{name}.truth.nc"
+    if not (data.exists() and truth.exists()):
+        box = Box.cube(50.0)
+        field, grid = make_phantom(phantom, box, seed), Grid.of_resolution(box, 100)
+        arc = (0.0, 180 * (1 - 1 / views))
+        ring = Ring(views=views, arc=arc, image_size=(pixels, pixels), pixel_pitch=4.0 / pixels)
+        write_netcdf(truth, [Volume.of(field.sample(grid), grid, "index_excess", N_AMBIENT)])
+        simulate(field, ring.cameras(), box, N_AMBIENT, noise, seed=seed + 1).write(data)
+    return data, truth
+
+
+def measure(
+    folder: Path, phantom: str, views: int, pixels: int, method: str, detail: Literal["auto", "on", "off"],
+    limit: float, noise: float, seed: int,
+) -> dict[str, Any]:  # fmt: skip
+    data, truth = measured(folder, phantom, views, pixels, noise, seed)
+    measurement = Measurement.read(data)
+    reconstructor: Reconstructor = replace(preset("fast"), time_limit=limit, seed=seed, device="cpu")
+    if method != "nerif":
+        reconstructor = {"gp": GaussianProcess, "tv": TotalVariation}[method](device="cpu")
+    with tempfile.TemporaryDirectory(dir=folder) as temporary:
+        out = Path(temporary) / "r"
+        start = time.perf_counter()
+        result = reconstruct_into(out, data, reconstructor, Run(report=False, detail=detail))
+        seconds = time.perf_counter() - start
+        metrics = ResultDirectory(out).metrics()
+    scores = evaluate_volume(result.field, read_volume(truth), measurement.n_ambient)
+    residuals = [view["rms_over_sigma"] for view in metrics.views]
+    return {
+        "l2": scores["l2"], "l2_variation": scores["l2_variation"], "seconds": seconds,
+        "residual": (sum(r**2 for r in residuals) / len(residuals)) ** 0.5, "added": metrics.detail is not None,
+    }  # fmt: skip
