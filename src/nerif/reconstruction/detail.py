@@ -58,6 +58,8 @@ FLOOR = 0.05  # of the largest a
 ITERATIONS = 30
 """Of conjugate gradients: more change the error by less than a hundredth of it (docs/decisions/057)."""
 SIGNIFICANT = 1.1  # sigma: residual above which there is detail
+UNRESOLVED = 2.5  # sigma: residual with detail above which the flow varies within a pixel
+EXPLAINED = 0.7  # of the signal of the field's own detail
 BETTER = 0.99  # of the error of a prediction, at most
 FINE_COST = 10.0  # seconds on the fine grid over those on the coarse one
 
@@ -94,6 +96,11 @@ class Posterior:
         return math.sqrt(self.iterate.residual / self.problem.target.noise)
 
     @property
+    def blurred(self) -> bool:
+        """Whether its prior has the blurred field as mean."""
+        return not torch.equal(self.problem.mean, self.detail.mean(blurred=False))
+
+    @property
     def objective(self) -> float:
         return self.problem.objective(self.iterate)
 
@@ -109,12 +116,17 @@ class Posterior:
         return self._splines(self.coefficients)
 
     def error(self, seed: int, on_iteration: Callable[[int, int], None] = lambda done, total: None) -> Field:
-        """Return a draw of the error: the difference between a draw from the posterior and its mean."""
+        """Return a draw of the error: the difference between a draw from the posterior and its mean.
+
+        It is multiplied by the residual over sigma, if that is above 1: the data err by more than their noise.
+
+        Source: Birge, Phys. Rev. 40 (1932) 207.
+        """
         draw, draws = self.coefficients, self.problem.draw(torch.Generator().manual_seed(seed))
         for i in range(ITERATIONS):
             draw = next(draws)
             on_iteration(i + 1, ITERATIONS)
-        return self._splines(draw - self.coefficients)
+        return self._splines(max(1.0, self.residual) * (draw - self.coefficients))
 
     def _splines(self, coefficients: Float[Tensor, "z y x"]) -> Field:
         scaled = coefficients * self.detail.problem.scale
@@ -214,6 +226,14 @@ class Detail:
         assert self.problem.noise is not None
         return math.sqrt(self.problem.residual(self.mean(blurred=False)) / self.problem.noise)
 
+    @property
+    def explained(self) -> float:
+        """The share of the signal of the field's own detail that it explains: 1 if nothing but noise remains."""
+        noise = self.problem.noise
+        assert noise is not None
+        left, blurred = (self.problem.residual(self.mean(b)) / noise - 1 for b in (False, True))
+        return 1 - left / blurred if blurred > 0 else 1.0
+
     def solve(self, problem: WhiteProblem, watch: Watch | None = None, iterations: int = ITERATIONS) -> Posterior:
         """Return the posterior after some iterations of conjugate gradients."""
         for i, iterate in zip(range(iterations), problem.solve(), strict=False):
@@ -266,7 +286,12 @@ class Choice:
         return not self.after > BETTER * self.before
 
     def solve(self, fine: Detail, coarse: Detail, watch: Watch | None = None) -> Posterior:
-        """Return the posterior on the fine grid."""
+        """Return the posterior on the fine grid.
+
+        The cross-validation ends early: a field that explains most of its detail by now is not blurred.
+        """
+        if self.blurred and fine.explained > EXPLAINED:
+            return Choice().solve(fine, coarse, watch)
         problem = None
         if self.passes != 1:
             first = coarse.solve(coarse.first(self.blurred))

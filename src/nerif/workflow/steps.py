@@ -22,7 +22,7 @@ from nerif.geometry import Grid
 from nerif.imaging.calibration.cameras_file import CalibratedCamera, write_cameras
 from nerif.physics.quantities import NOT_UNIFORM, masked_lines
 from nerif.reconstruction.base import Reconstruction, compose
-from nerif.reconstruction.detail import COARSE, ITERATIONS, SIGNIFICANT, Choice, Detail, choose
+from nerif.reconstruction.detail import COARSE, ITERATIONS, SIGNIFICANT, UNRESOLVED, Choice, Detail, choose
 from nerif.reconstruction.files import FIELD, checkpoints
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.rig.parameters import refinement_lines, with_corrections
@@ -168,10 +168,14 @@ class AddDetail(PipelineStep):
             return
         with job.monitor.counting("adding detail") as bar:
             posterior = choice.solve(fine, coarse, lambda p: bar(p.count, ITERATIONS))
+        if posterior.residual > UNRESOLVED and job.run.detail == "auto":
+            left = f"{posterior.residual:.1f} of {before:.1f} sigma remain with it, so the flow varies within a pixel"
+            job.monitor.say(f"detail left out: {left}")
+            return
         job.posterior = posterior
         job.detail_entries = {
             "residual_before": before, "residual_after": posterior.residual, "withheld_before": choice.before,
-            "withheld_after": choice.after, "blurred": choice.blurred, "voxels": max(fine.grid.shape),
+            "withheld_after": choice.after, "blurred": posterior.blurred, "voxels": max(fine.grid.shape),
             "iterations": posterior.count, "seconds": time.monotonic() - begin,
         }  # fmt: skip
         text = f"detail on {max(fine.grid.shape)} voxels, residual {before:.2f} to {posterior.residual:.2f} sigma"
