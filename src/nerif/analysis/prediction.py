@@ -209,8 +209,7 @@ def _samples(field: Field) -> int:
     """Samples along a ray."""
     if not isinstance(field, SumField):
         return SAMPLES
-    voxels = [max(part.grid.shape) for part in field.parts if isinstance(part, Splines)]
-    return max(SAMPLES, *(SAMPLES_PER_VOXEL * n for n in voxels))
+    return max([SAMPLES, *(SAMPLES_PER_VOXEL * max(p.grid.shape) for p in field.parts if isinstance(p, Splines))])
 
 
 def _points(cameras: Sequence[Camera]) -> float:

@@ -30,7 +30,7 @@ class GaussianProcess(SharedSettings):
     The first solution is Tikhonov's. Blurred, it is the mean; the local rms of its gradient is the size of detail. The
     posterior mean on a coarse grid takes its place, and that on the fine grid is the result.
 
-    Sources: Svensson, Non-parametric tomography using Gaussian processes, JET-CP(11)02 (2011); von Karman, PNAS 34
+    Sources: Svensson, Non-parametric tomography using Gaussian processes, EFDA-JET-PR(11)24 (2011); von Karman, PNAS 34
     (1948) 530, for the spectrum.
     """
 
