@@ -9,6 +9,7 @@ from nerif.cli.cli import main
 from nerif.fields.sum import SumField
 from nerif.fields.turbulence import TurbulentPlume
 from nerif.geometry import Box, Ring
+from nerif.reconstruction.detail import Choice
 from nerif.reconstruction.progress import Monitor
 from nerif.reconstruction.voxels.total_variation import TotalVariation
 from nerif.results.directory import ResultDirectory
@@ -90,6 +91,21 @@ def test_a_run_that_is_resumed_has_the_same_detail(made, turbulence, tmp_path):
     expected = made[1].field(points)  # total variation has other weights after an interruption
     assert float((resumed.field(points) - expected).norm()) < 0.05 * float(expected.norm())
     assert ResultDirectory(path).metrics().detail is not None
+
+
+def test_an_interruption_loses_nothing_of_the_fit(turbulence, tmp_path, monkeypatch):
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    run, out = Run(report=False, withhold=("none",), detail="on"), ResultDirectory(tmp_path / "r")
+    with monkeypatch.context() as patch:
+        patch.setattr(Choice, "solve", interrupt)
+        with pytest.raises((KeyboardInterrupt, SystemExit)):
+            reconstruct_into(out.path, turbulence, METHOD, run)
+    points = torch.rand(40, 3) * 20 - 10
+    before = out.field()[0](points)
+    result = reconstruct_into(out.path, turbulence, METHOD, run, resume=True)
+    torch.testing.assert_close(result.field.parts[0](points), before)
 
 
 @pytest.mark.parametrize(

@@ -166,6 +166,8 @@ class AddDetail(PipelineStep):
         if before < SIGNIFICANT and job.run.detail == "auto":
             job.monitor.say(f"detail left out: the residual is {before:.2f} sigma")
             return
+        job.begin()
+        job.out.write_field(result)  # an interruption loses nothing of the fit
         with job.monitor.counting("adding detail") as bar:
             posterior = choice.solve(fine, coarse, lambda p: bar(p.count, ITERATIONS))
         if posterior.residual > UNRESOLVED and job.run.detail == "auto":
