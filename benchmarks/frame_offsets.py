@@ -17,7 +17,7 @@ import torch
 from benchmarks.runner import N_AMBIENT, Settings, table
 from nerif.analysis.film_check import Excerpt, frame_shifts
 from nerif.analysis.prediction import predict
-from nerif.common.conventions import Points, Values, Vectors
+from nerif.common.arrays import Points, Values, Vectors
 from nerif.data.measurement import Measurement
 from nerif.fields.base import Field
 from nerif.fields.grid import VoxelField

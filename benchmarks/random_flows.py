@@ -8,7 +8,7 @@ import random
 import torch
 from torch import Tensor
 
-from nerif.common.conventions import Points, Values, Vectors
+from nerif.common.arrays import Points, Values, Vectors
 from nerif.fields.base import Field
 from nerif.fields.grid import VoxelField
 from nerif.fields.turbulence import inertial_scalar

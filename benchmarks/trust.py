@@ -37,9 +37,9 @@ AVERAGED = 0.04  # of the box edge
 GOALS = {"one": (0.63, 0.73), "two": (0.93, 0.97)}
 COLUMNS = {
     "phantom": "{phantom}", "noise": "{noise:g}", "views": "{views}", "f-number": "{f_number:g}", "method": "{method}",
-    "kind": "{kind}", "L2 of variation": "{l2_variation:.1%}", "in 1 std": "{one:.1%}", "in 2 std": "{two:.1%}",
-    "Spearman, all": "{spearman:.2f}", "Spearman, averaged": "{averaged:.2f}", "std / error": "{ratio:.2f}",
-    "cost": "{cost:.2f}",
+    "kind": "{kind}", "source": "{source}", "L2 of variation": "{l2_variation:.1%}", "in 1 std": "{one:.1%}",
+    "in 2 std": "{two:.1%}", "Spearman, all": "{spearman:.2f}", "Spearman, averaged": "{averaged:.2f}",
+    "std / error": "{ratio:.2f}", "cost": "{cost:.2f}",
 }  # fmt: skip
 
 
@@ -50,7 +50,7 @@ def cases(quick: bool) -> Iterator[Settings]:
             "steps": 10, "pixels": 16, "voxels": 16, "seed": 0,
         }  # fmt: skip
         return
-    phantoms = ("gaussians", "flame", "octahedron", "fire")
+    phantoms = ("gaussians", "flame", "octahedron", "fire", "turbulence")
     for phantom, noise, views, f_number in itertools.product(phantoms, (0.05, 0.15), (6, 9, 18), (0.0, 8.0)):
         yield {
             "phantom": phantom, "noise": noise, "views": views, "f_number": f_number, "method": "nerif", "kind": "fast",
@@ -96,7 +96,7 @@ def measure(
         "l2_variation": scores["l2_variation"], "one": coverage["one_sigma_in_flow"],
         "two": coverage["two_sigma_in_flow"], "spearman": coverage["spearman"], "averaged": float(spearmanr(local,
         std[flow].numpy()).statistic), "ratio": float(std[flow].norm() / error[flow].norm()),
-        "cost": seconds / (seconds - uncertainty["seconds"]),
+        "source": uncertainty["source"], "cost": seconds / (seconds - uncertainty["seconds"]),
     }  # fmt: skip
 
 

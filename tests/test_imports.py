@@ -5,7 +5,8 @@ from __future__ import annotations
 import subprocess
 import sys
 
-from nerif.cli.cli import INPUTS, main
+from nerif.cli.arguments import INPUTS
+from nerif.cli.cli import main
 
 HEAVY = (
     "xarray",

@@ -359,7 +359,7 @@ def test_a_forced_run_with_bad_input_keeps_the_old_result(work, result, refusal,
         ("simulate -o nowhere/s.nc", ["nowhere"]),
         ("simulate -o s.nc --noise -1", ["noise"]),
         ("evaluate nowhere --truth t.nc", ["nowhere"]),
-        ("export nowhere -o x.stl", [".vti"]),
+        ("export . -o x.stl", [".vti"]),
     ],
 )
 def test_invalid_command_lines(tmp_path, monkeypatch, refusal, arguments, words):

@@ -101,7 +101,8 @@ def test_conjugate_gradients_reach_the_posterior_mean(white, prior):
 def test_draws_have_mean_and_covariance_of_the_posterior(white, prior):
     mean, covariance = analytic(white)
     generator, count = torch.Generator().manual_seed(11), 300
-    draws = torch.stack([after(white.draw(generator), ITERATIONS).flatten() for _ in range(count)])
+    z = mean.reshape(SHAPE)
+    draws = torch.stack([after(white.draw(z, generator), ITERATIONS).flatten() for _ in range(count)])
     matrix = fields(prior)
     center, spread = matrix @ mean + white.mean.flatten(), matrix @ covariance @ matrix.T
     size = len(center)
@@ -119,8 +120,9 @@ def test_with_the_true_prior_68_and_95_per_cent_lie_within_one_and_two_deviation
         z = torch.randn(SHAPE, generator=generator, dtype=torch.float64)
         noise = torch.randn(white.data.shape, generator=generator, dtype=torch.float64)
         white.data = white.forward(z) + math.sqrt(white.variance) * noise
-        mean = white.field(after(white.solve(), ITERATIONS).x)
-        draws = torch.stack([after(white.draw(generator), ITERATIONS) for _ in range(8)])
+        at = after(white.solve(), ITERATIONS).x
+        mean = white.field(at)
+        draws = torch.stack([after(white.draw(at, generator), ITERATIONS) for _ in range(8)])
         deviation = (draws - mean).square().mean(dim=0).sqrt()
         ratios.append((mean - prior(z)).abs() / deviation)
     within = torch.stack(ratios)

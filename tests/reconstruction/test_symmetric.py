@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from nerif.common.conventions import Points
+from nerif.common.arrays import Points
 from nerif.fields.base import Field
 from nerif.fields.phantoms import make_phantom
 from nerif.forward.base import midpoints

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerif.common.conventions import Points, Values, Vectors
+from nerif.common.arrays import Points, Values, Vectors
 from nerif.data.volume import Volume
 from nerif.fields.base import Field, in_chunks
 from nerif.geometry.pose import rotation_matrix

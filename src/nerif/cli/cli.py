@@ -33,22 +33,6 @@ COMMANDS = {
     "demo": "simulate, reconstruct and evaluate a small flame",
 }
 MODULES = {"app": "nerif.app.command"}  # of commands outside nerif.cli.commands
-MEASUREMENT = "no such file; expected a measurement (NetCDF-4, BOST-1.1)"
-RESULT = "no such directory; expected one written by nerif reconstruct"
-INPUTS = {
-    "displacement": "no such folder; expected one with a folder for each view",
-    "mask": MEASUREMENT,
-    "check": "no such file or store; expected a measurement (.nc), or one over time (.zarr)",
-    "reconstruct": MEASUREMENT,
-    "project": RESULT,
-    "evaluate": f"{RESULT}, or a store (.zarr) of nerif sequence",
-    "sequence": "no such store; expected a measurement sequence (Zarr, BOST-1.1)",
-    "movie": "no such store; expected volumes over time (Zarr)",
-    "report": f"{RESULT}, or a store (.zarr) of nerif sequence",
-    "figures": RESULT,
-    "info": "no such file or folder; expected a measurement, volume or result",
-}
-"""Commands whose first word is a file or folder to read, with the error where it does not exist."""
 MAX_FILES_LISTED = 4  # after an interruption
 
 
@@ -100,15 +84,14 @@ def _run(words: list[str]) -> int:
         nearest = difflib.get_close_matches(words[0], COMMANDS, n=1, cutoff=0)[0]
         return _fail(f"unknown command '{words[0]}'; did you mean '{nearest}'? See nerif --help")
 
-    if message := _missing_input(words):
-        return _fail(message)
-
+    from nerif.cli.arguments import check_arguments
     from nerif.common.conventions import InputError
     from nerif.common.installation import stranger
 
     if warning := stranger():
         print(f"nerif: {warning}", file=sys.stderr)
     try:
+        check_arguments(words[0], words[1:])
         command = importlib.import_module(MODULES.get(words[0], f"nerif.cli.commands.{words[0]}"))
         device = importlib.import_module("nerif.reconstruction.device")
         device.keep_freed_memory()
@@ -125,15 +108,6 @@ def _run(words: list[str]) -> int:
     except OSError as error:
         return _fail(f"{error.filename or 'file'}: {error.strerror or error}")
     return 0
-
-
-def _missing_input(words: list[str]) -> str:
-    """Return the error for an input that does not exist, before anything is imported that takes seconds; "" if none."""
-    command, first = words[0], words[1] if len(words) > 1 else ""
-    helps = {"-h", "--help"} & {*words}
-    if helps or command not in INPUTS or not first or first.startswith("-") or os.path.lexists(first):
-        return ""
-    return f"{first}: {INPUTS[command]}"
 
 
 def _files_written() -> str:

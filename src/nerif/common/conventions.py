@@ -1,4 +1,4 @@
-"""Axis names, units and array aliases (prose: docs/conventions.md).
+"""Axis names and units (prose: docs/conventions.md).
 
 Lengths are millimetres, image quantities pixels, angles radians, times seconds. Volumes are indexed [z, y, x].
 """
@@ -7,9 +7,6 @@ from __future__ import annotations
 
 import math
 from typing import SupportsFloat
-
-from jaxtyping import Bool, Float
-from torch import Tensor
 
 __all__ = [
     "AMBIENT_INDEX",
@@ -20,12 +17,6 @@ __all__ = [
     "LARGEST_LENGTH",
     "STATISTICS",
     "InputError",
-    "Mask",
-    "Matrix3",
-    "Pixels",
-    "Points",
-    "Values",
-    "Vectors",
     "ambient_index",
     "parse_faces",
     "unit_shown",
@@ -58,13 +49,6 @@ LARGEST_INDEX = 4.0
 
 LARGEST_LENGTH = 1e7
 """Ten kilometres in mm: a longer length is taken for an error of unit."""
-
-Points = Float[Tensor, "*batch 3"]  # mm, world frame
-Vectors = Float[Tensor, "*batch 3"]  # direction (1) or gradient (1/mm)
-Values = Float[Tensor, "*batch"]  # index excess n - n_ambient (1)
-Pixels = Float[Tensor, "*batch 2"]  # px, (column u, row v), (0, 0) the centre of the top-left pixel
-Matrix3 = Float[Tensor, "3 3"]
-Mask = Bool[Tensor, "*batch"]
 
 
 class InputError(ValueError):

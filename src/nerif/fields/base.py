@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerif.common.conventions import Points, Values, Vectors
+from nerif.common.arrays import Points, Values, Vectors
 from nerif.common.pauses import pause
 from nerif.geometry import Grid
 

@@ -14,8 +14,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerif.common.arrays import Points, Values, Vectors
 from nerif.common.axis_order import order_remedy
-from nerif.common.conventions import InputError, Points, Values, Vectors, parse_faces
+from nerif.common.conventions import InputError, parse_faces
 from nerif.fields.base import Field
 from nerif.geometry import Grid
 

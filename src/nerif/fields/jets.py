@@ -13,7 +13,7 @@ from abc import abstractmethod
 import torch
 from torch import Tensor
 
-from nerif.common.conventions import Points, Values, Vectors
+from nerif.common.arrays import Points, Values, Vectors
 from nerif.fields.base import Field
 from nerif.geometry import Box
 

@@ -18,7 +18,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from nerif.common.conventions import InputError, Points, Values, Vectors
+from nerif.common.arrays import Points, Values, Vectors
+from nerif.common.conventions import InputError
 from nerif.common.settings import check_settings
 from nerif.common.transfer import constant
 from nerif.fields.base import Field

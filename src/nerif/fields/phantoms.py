@@ -17,7 +17,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerif.common.conventions import InputError, Points, Values, Vectors
+from nerif.common.arrays import Points, Values, Vectors
+from nerif.common.conventions import InputError
 from nerif.fields.base import Field
 from nerif.fields.jets import AXISYMMETRIC
 from nerif.fields.turbulence import Fire, TurbulentPlume

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from nerif.common.conventions import Points, Values, Vectors
+from nerif.common.arrays import Points, Values, Vectors
 from nerif.fields.base import Field
 
 __all__ = ["SumField"]

@@ -9,7 +9,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from nerif.common.conventions import InputError, Points, Values, Vectors
+from nerif.common.arrays import Points, Values, Vectors
+from nerif.common.conventions import InputError
 from nerif.fields.base import Field, in_chunks
 from nerif.fields.grid import VoxelField
 from nerif.fields.network import ACTIVATIONS, UNBOUNDED, Network, NetworkShape, NeuralField, encode, encode_pullback

@@ -7,7 +7,8 @@ import math
 import torch
 from torch import Tensor
 
-from nerif.common.conventions import InputError, Points, Values, Vectors
+from nerif.common.arrays import Points, Values, Vectors
+from nerif.common.conventions import InputError
 from nerif.fields.base import Field
 from nerif.fields.grid import VoxelField
 from nerif.geometry import Box, Grid

@@ -19,7 +19,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerif.common.conventions import LARGEST_LENGTH, InputError, Matrix3, Pixels, Points, Values
+from nerif.common.arrays import Matrix3, Pixels, Points, Values
+from nerif.common.conventions import LARGEST_LENGTH, InputError
 from nerif.geometry.distortion import UPRIGHT, Array, from_sensor, to_sensor
 from nerif.geometry.lens import Lens, LensDiscs
 from nerif.geometry.rays import BackgroundPoints, Rays

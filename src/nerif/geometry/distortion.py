@@ -25,7 +25,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerif.common.conventions import Pixels
+from nerif.common.arrays import Pixels
 
 __all__ = [
     "POWERS", "UPRIGHT", "Array", "distort", "fold", "from_sensor", "sensor_axes", "tilt", "tilt_slopes", "to_sensor",

@@ -13,7 +13,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from nerif.common.conventions import InputError, Points
+from nerif.common.arrays import Points
+from nerif.common.conventions import InputError
 from nerif.common.findings import Finding
 from nerif.geometry.camera import Camera, Plane
 from nerif.geometry.grid import Box

@@ -25,7 +25,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerif.common.conventions import FACES, InputError, Points, Vectors
+from nerif.common.arrays import Points, Vectors
+from nerif.common.conventions import FACES, InputError
 from nerif.geometry.grid import Box
 
 __all__ = ["NAMES", "NO_SYMMETRY", "Axis", "Symmetry", "parse_symmetry"]

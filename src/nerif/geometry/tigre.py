@@ -26,7 +26,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerif.common.conventions import InputError, Matrix3, whole
+from nerif.common.arrays import Matrix3
+from nerif.common.conventions import InputError, whole
 from nerif.geometry.astra import check_vectors, depth_behind, vectors_of
 from nerif.geometry.camera import PERSPECTIVE, Camera
 from nerif.geometry.grid import Grid

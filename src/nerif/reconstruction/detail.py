@@ -15,6 +15,7 @@ The voxels are smaller than the pixels: detail that they cannot represent would 
 
 from __future__ import annotations
 
+import itertools
 import math
 import time
 from collections.abc import Callable
@@ -55,13 +56,16 @@ OUTER_SCALE = 0.1  # L; this and the widths are shares of the longest edge of th
 MEAN_WIDTH = 0.04  # standard deviation of the Gaussian that blurs the reconstruction
 SLOPE_WIDTH, DETAIL_WIDTH = 0.07, 0.04  # of the Gaussians for the local rms of grad q and of a h
 FLOOR = 0.05  # of the largest a
-ITERATIONS = 30
-"""Of conjugate gradients: more change the error by less than a hundredth of it (docs/decisions/057)."""
+ITERATIONS, COARSE_ITERATIONS = 12, 16
+"""Of conjugate gradients on the fine and the coarse grid: more do not reduce the error (docs/decisions/057)."""
+TRIAL_ITERATIONS = 6
+"""Of a trial: the coarse grid predicts no better with more, which fit what it cannot represent."""
 SIGNIFICANT = 1.1  # sigma: residual above which there is detail
 UNRESOLVED = 2.5  # sigma: residual with detail above which the flow varies within a pixel
 EXPLAINED = 0.7  # of the signal of the field's own detail
 BETTER = 0.99  # of the error of a prediction, at most
-FINE_COST = 10.0  # seconds on the fine grid over those on the coarse one
+TRIALS = 4  # blurred or not, in one pass or two
+FINE_COST = 28.0  # seconds that detail takes over those of a trial
 
 Watch = Callable[["Posterior"], bool | None]
 """Called after each iteration; returns True to stop."""
@@ -122,7 +126,7 @@ class Posterior:
 
         Source: Birge, Phys. Rev. 40 (1932) 207.
         """
-        draw, draws = self.coefficients, self.problem.draw(torch.Generator().manual_seed(seed))
+        draw, draws = self.coefficients, self.problem.draw(self.iterate.x, torch.Generator().manual_seed(seed))
         for i in range(ITERATIONS):
             draw = next(draws)
             on_iteration(i + 1, ITERATIONS)
@@ -243,6 +247,15 @@ class Detail:
                 break
         return posterior
 
+    def trial(self, problem: WhiteProblem, target: Target) -> tuple[Posterior, float]:
+        """Return a rough posterior, and the lowest error of the prediction of other data on the way to it."""
+        errors: list[float] = []
+
+        def watch(posterior: Posterior) -> None:
+            errors.append(self.prediction_error(target, posterior.coefficients))
+
+        return self.solve(problem, watch, TRIAL_ITERATIONS), min(errors)
+
     def others(self, measurement: Measurement) -> Target:
         """Return the data of other views, as those of this one."""
         measurement = apply_aperture(measurement, self.settings.aperture)
@@ -294,28 +307,36 @@ class Choice:
             return Choice().solve(fine, coarse, watch)
         problem = None
         if self.passes != 1:
-            first = coarse.solve(coarse.first(self.blurred))
-            second = coarse.solve(coarse.next(first))
+            first = coarse.solve(coarse.first(self.blurred), iterations=COARSE_ITERATIONS)
+            second = coarse.solve(coarse.next(first), iterations=COARSE_ITERATIONS)
             if self.passes or second.objective < first.objective:
                 problem = fine.like(second.problem, self.blurred)
         return fine.solve(problem or fine.first(self.blurred), watch)
 
 
 def choose(
-    coarse: Detail, withheld: Measurement, on_done: Callable[[int, int], None] = lambda done, total: None
-) -> Choice:
-    """Return which mean and prior predict the withheld views of a field best, on a coarse grid."""
-    target = coarse.others(withheld)
+    coarse: Detail, withheld: Measurement, most: float = math.inf,
+    on_done: Callable[[int, int], None] = lambda done, total: None,
+) -> Choice:  # fmt: skip
+    """Return which mean and prior predict the withheld views of a field best, on a coarse grid.
+
+    Parameters
+    ----------
+    most : seconds that the detail may take; once it is expected to take more, no further trial is made
+    """
+    target, start = coarse.others(withheld), time.perf_counter()
     best = Choice(before=coarse.prediction_error(target, coarse.mean(blurred=False)), after=math.inf)
-    start = time.perf_counter()
-    for i, blurred in enumerate((False, True)):
-        first = coarse.solve(coarse.first(blurred))
-        for passes, posterior in ((1, first), (2, coarse.solve(coarse.next(first)))):
-            error = coarse.prediction_error(target, posterior.coefficients)
-            if error < best.after:
-                best = replace(best, blurred=blurred, passes=passes, after=error)
-            on_done(2 * i + passes, 4)
-    return replace(best, seconds=FINE_COST * (time.perf_counter() - start) / 4)
+    posterior: Posterior | None = None
+    for trial, (blurred, passes) in enumerate(itertools.product((False, True), (1, 2)), start=1):
+        problem = coarse.next(posterior) if posterior and passes == 2 else coarse.first(blurred)
+        posterior, error = coarse.trial(problem, target)
+        if error < best.after:
+            best = replace(best, blurred=blurred, passes=passes, after=error)
+        best = replace(best, seconds=FINE_COST * (time.perf_counter() - start) / trial)
+        on_done(trial, TRIALS)
+        if trial > 1 and best.seconds > most:  # the first takes longer
+            break
+    return best
 
 
 def check_sigma(measurement: Measurement) -> None:

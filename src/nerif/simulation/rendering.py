@@ -15,7 +15,8 @@ from annotated_types import Ge, Le
 from jaxtyping import Float
 from torch import Tensor
 
-from nerif.common.conventions import InputError, Points
+from nerif.common.arrays import Points
+from nerif.common.conventions import InputError
 from nerif.common.settings import NonNegative, Positive, check_settings
 from nerif.fields.base import Field
 from nerif.forward.ray_tracing import trace

@@ -114,7 +114,7 @@ class ChooseDetail(PipelineStep):
         if coarse.residual < SIGNIFICANT and not on:
             return None
         with job.monitor.counting("choosing the detail") as bar:
-            choice = choose(coarse, validation.withheld, bar)
+            choice = choose(coarse, validation.withheld, math.inf if on else most, bar)
         errors = f"{choice.before:.2f} sigma without it, {choice.after:.2f} with it"
         job.monitor.say(f"detail: the withheld view is predicted to {errors}")
         if choice.seconds > most and not on:

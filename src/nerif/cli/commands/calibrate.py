@@ -11,7 +11,8 @@ from typing import Annotated
 import torch
 import tyro
 
-from nerif.cli.commands.output import check_output, counting_bar, say
+from nerif.cli.arguments import check_output
+from nerif.cli.commands.output import counting_bar, say
 from nerif.cli.commands.settings import Flat, Settings, command
 from nerif.common.conventions import InputError
 from nerif.common.files import ending

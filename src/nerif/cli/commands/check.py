@@ -12,7 +12,8 @@ from annotated_types import Ge
 from nerif.analysis.consistency import Consistency, check_consistency, corrected
 from nerif.analysis.film_check import check_film
 from nerif.analysis.rig_check import RigCheck, check_rig
-from nerif.cli.commands.output import MONITOR, check_output, counting_bar, say
+from nerif.cli.arguments import check_output
+from nerif.cli.commands.output import MONITOR, counting_bar, say
 from nerif.cli.commands.settings import Settings
 from nerif.common.conventions import InputError
 from nerif.common.files import ending

@@ -8,7 +8,8 @@ from typing import Annotated
 
 import tyro
 
-from nerif.cli.commands.output import check_output, say
+from nerif.cli.arguments import check_output
+from nerif.cli.commands.output import say
 from nerif.cli.commands.settings import Flat, Settings, command
 from nerif.geometry import Ring
 from nerif.simulation.design import DesignSettings, Expectation, expect

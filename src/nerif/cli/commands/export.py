@@ -8,7 +8,8 @@ from typing import Annotated, Literal
 
 import tyro
 
-from nerif.cli.commands.output import check_output, counting_bar, say
+from nerif.cli.arguments import check_output
+from nerif.cli.commands.output import counting_bar, say
 from nerif.cli.commands.settings import Settings, command
 from nerif.common.conventions import InputError
 from nerif.data.exports import FORMATS, PROGRAMS, export, export_geometry

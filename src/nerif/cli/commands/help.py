@@ -8,7 +8,8 @@ import types
 import typing
 from typing import Any, Literal
 
-from nerif.cli.commands.settings import ALIASES, flat_names, help_of
+from nerif.cli.arguments import ALIASES
+from nerif.cli.commands.settings import flat_names, help_of
 
 __all__ = ["GROUPS", "grouped_help"]
 

@@ -9,14 +9,11 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
-from nerif.common.conventions import InputError
-from nerif.common.files import ending
 from nerif.reconstruction.base import OnStep, Step, compose
 from nerif.reconstruction.progress import Monitor
 
-__all__ = ["MONITOR", "check_output", "counting_bar", "figures_bar", "say", "silence"]
+__all__ = ["MONITOR", "counting_bar", "figures_bar", "say", "silence"]
 
 SAME_SIGNAL = 0.5  # s, within which a second Ctrl-C is the first one, passed on by a launcher such as torchrun
 FIRST_LINE, LINE_INTERVAL = 2.0, 15.0  # s, of progress without a terminal
@@ -38,24 +35,6 @@ def _say_safely(text: str) -> None:
 def silence() -> None:
     """Discard all further standard output."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-
-
-def check_output(path: Path, force: bool, *others: Path, endings: tuple[str, ...] = ()) -> None:
-    """Check the ending of an output file (--out), that its folder exists, and that nothing is overwritten unasked.
-
-    Parameters
-    ----------
-    others : files written beside it
-    """
-    if endings and ending(path) not in endings:
-        raise InputError(f"expected a name ending in {' or '.join(endings)}, got '{path.name}'", field="out")
-    for file in (path, *others):
-        if not file.parent.is_dir():
-            raise InputError(f"the folder {file.parent} does not exist; create it", field=file)
-        if file.is_dir() and ending(file) != ".zarr":
-            raise InputError("expected the name of a file, got a folder", field=file)
-        if file.exists() and not force:
-            raise InputError("exists already and was left as it is; give another --out, or --force", field=file)
 
 
 @contextmanager

@@ -8,7 +8,8 @@ from typing import Annotated
 
 import tyro
 
-from nerif.cli.commands.output import check_output, say
+from nerif.cli.arguments import check_output
+from nerif.cli.commands.output import say
 from nerif.cli.commands.settings import Flat, Settings, read_settings, setting_of
 from nerif.common.conventions import InputError
 from nerif.imaging import patterns as background
@@ -17,6 +18,9 @@ from nerif.imaging.calibration.targets import CalibrationTarget
 from nerif.imaging.patterns import Background, paper_for, print_pattern
 
 __all__ = ["PrintBackground", "PrintTarget", "main", "run"]
+
+
+KINDS = (*background.KINDS, *targets.KINDS)
 
 
 @dataclass(frozen=True)
@@ -61,9 +65,8 @@ def run(settings: PrintBackground | PrintTarget) -> None:
 def main(arguments: list[str]) -> None:
     """Parse and run."""
     kind = setting_of("kind", arguments, Background.kind)
-    if kind not in (*background.KINDS, *targets.KINDS):
-        kinds = ", ".join((*background.KINDS, *targets.KINDS))
-        raise InputError(f"expected one of {kinds}, got '{kind}'", field="kind")
+    if kind not in KINDS:
+        raise InputError(f"expected one of {', '.join(KINDS)}, got '{kind}'", field="kind")
     if kind in targets.KINDS:
         run(read_settings(PrintTarget(tyro.MISSING, pattern=CalibrationTarget(kind)), arguments, "pattern"))
     else:

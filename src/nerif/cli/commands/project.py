@@ -9,7 +9,8 @@ from typing import Annotated
 import tyro
 
 from nerif.analysis.prediction import predict
-from nerif.cli.commands.output import check_output, counting_bar, say
+from nerif.cli.arguments import check_output
+from nerif.cli.commands.output import counting_bar, say
 from nerif.cli.commands.settings import Flat, Settings, command
 from nerif.common.conventions import InputError, with_unit
 from nerif.data.measurement import Measurement

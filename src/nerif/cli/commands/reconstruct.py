@@ -14,9 +14,10 @@ from typing import Annotated, Any, Literal
 import psutil
 import tyro
 
+from nerif.cli.arguments import flag_value
 from nerif.cli.commands.help import grouped_help
 from nerif.cli.commands.output import MONITOR
-from nerif.cli.commands.settings import Flat, Settings, flag_value, read_settings, setting_of
+from nerif.cli.commands.settings import Flat, Settings, read_settings, setting_of
 from nerif.common.conventions import InputError
 from nerif.common.installation import install
 from nerif.common.settings import Count

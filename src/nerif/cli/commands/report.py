@@ -8,7 +8,8 @@ from typing import Annotated
 
 import tyro
 
-from nerif.cli.commands.output import MONITOR, check_output
+from nerif.cli.arguments import check_output
+from nerif.cli.commands.output import MONITOR
 from nerif.cli.commands.settings import Settings, command
 from nerif.common.files import ending
 from nerif.results.directory import REPORT

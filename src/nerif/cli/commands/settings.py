@@ -16,13 +16,14 @@ import json
 import re
 import textwrap
 import typing
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
 import tyro
 
+from nerif.cli.arguments import ALIASES, flag_value, words_of
 from nerif.common.conventions import InputError
 from nerif.common.files import check_known, local_path, read_toml
 from nerif.common.settings import check_settings
@@ -31,7 +32,6 @@ __all__ = [
     "Flat",
     "Settings",
     "command",
-    "flag_value",
     "flat_names",
     "help_of",
     "merge",
@@ -44,8 +44,6 @@ T = TypeVar("T")
 
 Flat = tyro.conf.arg(name="")
 """Marks a field whose own fields are options without a prefix."""
-ALIASES = {"from": "source", "drawn": "drawings"}
-"""Further names of options, and those of their fields."""
 IGNORED_TABLES = ("about",)  # results in run.toml
 
 
@@ -159,23 +157,9 @@ def _typed(hint: Any, name: str, value: Any, source: str) -> Any:
         raise InputError(f"'{name}' = {value!r}: {reason}", field=source) from None
 
 
-def flag_value(arguments: list[str], *flags: str) -> str | None:
-    """Return the value of an option before the command line is parsed."""
-    for i, word in enumerate(arguments):
-        for flag in flags:
-            if word == flag and i + 1 < len(arguments):
-                return arguments[i + 1]
-            if flag.startswith("--") and word.startswith(flag + "="):
-                return word.split("=", 1)[1]
-    return None
-
-
 def parse(default: T, arguments: list[str], prog: str, description: str) -> T:
     """Parse the arguments of a command; an InputError has the error of tyro in one line."""
-    arguments = [word for pair in _with_set(arguments) for word in pair]
-    arguments = [
-        re.sub(r"^--([\w.-]+)", lambda m: f"--{ALIASES.get(m[1], m[1].replace('_', '-'))}", a) for a in arguments
-    ]
+    arguments = words_of(arguments)
     error = io.StringIO()
     try:
         with contextlib.redirect_stderr(error):
@@ -184,19 +168,6 @@ def parse(default: T, arguments: list[str], prog: str, description: str) -> T:
         if not stop.code:
             raise
         raise InputError(_one_line(error.getvalue(), prog)) from None
-
-
-def _with_set(arguments: list[str]) -> Iterator[list[str]]:
-    """Turn --set NAME=VALUE into --NAME VALUE."""
-    words = iter(arguments)
-    for word in words:
-        if word != "--set":
-            yield [word]
-            continue
-        name, _, value = next(words, "").partition("=")
-        if not name or not value:
-            raise InputError(f"expected NAME=VALUE, such as network.width=128, got '{name}'", field="set")
-        yield [f"--{name}", *value.split()]
 
 
 def _one_line(box: str, prog: str) -> str:

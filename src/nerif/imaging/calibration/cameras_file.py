@@ -33,7 +33,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerif.common.conventions import InputError, Matrix3
+from nerif.common.arrays import Matrix3
+from nerif.common.conventions import InputError
 from nerif.common.files import check_known, read_toml, write_toml
 from nerif.geometry import PERSPECTIVE, Box, Camera, Lens, Plane, Projection, projection_named
 from nerif.geometry.distortion import UPRIGHT

@@ -7,7 +7,7 @@ standard deviation. With n values of noise v (mean square) the posterior mean is
 
     min_z  |F x - b|^2 / v + |z|^2
 
-and the minimum for b + e with |z - z0|^2, with noise e and z0 drawn from the prior, is a draw of the posterior.
+and the minimum of |F x - e|^2 / v + |z - z0|^2, with noise e and z0 drawn from the prior, is a draw of its error.
 
 Sources: von Karman, PNAS 34 (1948) 530; perturb and solve: Papandreou & Yuille, NIPS (2010), Bardsley et al., SIAM J.
 Sci. Comput. 36 (2014) A1895.
@@ -106,15 +106,15 @@ class WhiteProblem(Problem):
         """Yield iterates z towards the posterior mean, without end."""
         yield from conjugate_gradients(self, Penalty(self, "identity"), self.variance * self.voxels, self.zero())
 
-    def draw(self, generator: torch.Generator) -> Iterator[Float[Tensor, "z y x"]]:
-        """Yield approximations x of a draw from the posterior, without end."""
+    def draw(self, z: Float[Tensor, "z y x"], generator: torch.Generator) -> Iterator[Float[Tensor, "z y x"]]:
+        """Yield approximations x of a draw from the posterior, whose mean is at z, without end."""
         start = self._white(generator)
         noise = torch.randn(self.data.shape, generator=generator).to(self.data) * math.sqrt(self.variance)
         moved = WhiteProblem(self.problem, self.prior, self.mean)
-        moved.data = self.data + noise - self.forward(start)
+        moved.data = noise - self.forward(start)
         moved.__dict__["response"] = self.response
         for iterate in moved.solve():
-            yield self.field(start + iterate.x)
+            yield self.field(z + start + iterate.x)
 
     def field(self, z: Float[Tensor, "z y x"]) -> Float[Tensor, "z y x"]:
         """Return mean + a h within the bounds of the problem."""
