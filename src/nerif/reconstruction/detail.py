@@ -56,12 +56,12 @@ OUTER_SCALE = 0.1  # L; this and the widths are shares of the longest edge of th
 MEAN_WIDTH = 0.04  # standard deviation of the Gaussian that blurs the reconstruction
 SLOPE_WIDTH, DETAIL_WIDTH = 0.07, 0.04  # of the Gaussians for the local rms of grad q and of a h
 FLOOR = 0.05  # of the largest a
-ITERATIONS, COARSE_ITERATIONS = 12, 16
-"""Of conjugate gradients on the fine and the coarse grid: more do not reduce the error (docs/decisions/057)."""
+ITERATIONS, CONVERGED = 30, 0.03
+"""Of conjugate gradients, at most, and the relative fall of the objective at which they end (docs/decisions/057)."""
 TRIAL_ITERATIONS = 6
 """Of a trial: the coarse grid predicts no better with more, which fit what it cannot represent."""
+DRAW_ITERATIONS = 12
 SIGNIFICANT = 1.1  # sigma: residual above which there is detail
-UNRESOLVED = 2.5  # sigma: residual with detail above which the flow varies within a pixel
 EXPLAINED = 0.7  # of the signal of the field's own detail
 BETTER = 0.99  # of the error of a prediction, at most
 TRIALS = 4  # blurred or not, in one pass or two
@@ -120,17 +120,12 @@ class Posterior:
         return self._splines(self.coefficients)
 
     def error(self, seed: int, on_iteration: Callable[[int, int], None] = lambda done, total: None) -> Field:
-        """Return a draw of the error: the difference between a draw from the posterior and its mean.
-
-        It is multiplied by the residual over sigma, if that is above 1: the data err by more than their noise.
-
-        Source: Birge, Phys. Rev. 40 (1932) 207.
-        """
+        """Return a draw of the error: the difference between a draw from the posterior and its mean."""
         draw, draws = self.coefficients, self.problem.draw(self.iterate.x, torch.Generator().manual_seed(seed))
-        for i in range(ITERATIONS):
+        for i in range(DRAW_ITERATIONS):
             draw = next(draws)
-            on_iteration(i + 1, ITERATIONS)
-        return self._splines(max(1.0, self.residual) * (draw - self.coefficients))
+            on_iteration(i + 1, DRAW_ITERATIONS)
+        return self._splines(draw - self.coefficients)
 
     def _splines(self, coefficients: Float[Tensor, "z y x"]) -> Field:
         scaled = coefficients * self.detail.problem.scale
@@ -239,13 +234,34 @@ class Detail:
         return 1 - left / blurred if blurred > 0 else 1.0
 
     def solve(self, problem: WhiteProblem, watch: Watch | None = None, iterations: int = ITERATIONS) -> Posterior:
-        """Return the posterior after some iterations of conjugate gradients."""
+        """Return the posterior, after so many iterations at most."""
+        last = math.inf
         for i, iterate in zip(range(iterations), problem.solve(), strict=False):
             pause()
             posterior = Posterior(self, problem, iterate, i + 1)
-            if watch is not None and watch(posterior):
+            if (watch is not None and watch(posterior)) or posterior.objective > (1 - CONVERGED) * last:
                 break
+            last = posterior.objective
         return posterior
+
+    def posterior(self, problem: WhiteProblem, watch: Watch | None = None, iterations: int = ITERATIONS) -> Posterior:
+        """Return the posterior for data that err by as much as a first solution leaves of them.
+
+        They err by more than their noise where the flow varies within a pixel or a voxel.
+
+        Source: Birge, Phys. Rev. 40 (1932) 207.
+        """
+        stopped = False
+
+        def watching(posterior: Posterior) -> bool:
+            nonlocal stopped
+            stopped = watch is not None and bool(watch(posterior))
+            return stopped
+
+        first = self.solve(problem, watching, iterations)
+        if stopped or first.residual <= 1:
+            return first
+        return self.solve(problem.with_errors(first.residual), watching, iterations)
 
     def trial(self, problem: WhiteProblem, target: Target) -> tuple[Posterior, float]:
         """Return a rough posterior, and the lowest error of the prediction of other data on the way to it."""
@@ -307,11 +323,11 @@ class Choice:
             return Choice().solve(fine, coarse, watch)
         problem = None
         if self.passes != 1:
-            first = coarse.solve(coarse.first(self.blurred), iterations=COARSE_ITERATIONS)
-            second = coarse.solve(coarse.next(first), iterations=COARSE_ITERATIONS)
+            first = coarse.solve(coarse.first(self.blurred))
+            second = coarse.solve(coarse.next(first))
             if self.passes or second.objective < first.objective:
                 problem = fine.like(second.problem, self.blurred)
-        return fine.solve(problem or fine.first(self.blurred), watch)
+        return fine.posterior(problem or fine.first(self.blurred), watch)
 
 
 def choose(

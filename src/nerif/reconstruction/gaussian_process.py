@@ -45,7 +45,7 @@ class GaussianProcess(SharedSettings):
     hull: bool = True
     """Fix voxels outside the visual hull of the flow masks at the ambient index."""
     iterations: Count = 30
-    """Iterations of conjugate gradients on each grid."""
+    """Iterations of conjugate gradients on each grid, at most."""
 
     def in_two(self) -> tuple[GaussianProcess, GaussianProcess]:
         short = replace(self, voxels=max(8, self.voxels // 2), time_limit=SHORT_RUN * self.time_limit)
@@ -91,14 +91,14 @@ class GaussianProcess(SharedSettings):
         corrected, field = with_corrections(measurement, first.rig), first.field
         for coarse in (COARSE, 1):
             detail = Detail(field, corrected, self, first.axis, coarse, self.voxels)
-            posterior = detail.solve(detail.first(blurred=True), watch, self.iterations)
+            posterior = detail.posterior(detail.first(blurred=True), watch, self.iterations)
             field = posterior.splines
             if stopped:
                 break
         messages = {
             "interrupted": "stopped on request; continue with --resume",
             "time_limit": f"stopped at the time limit, after {history[-1]['seconds']:.0f} s",
-            "": f"{self.iterations} iterations on {max(detail.grid.shape)} voxels; "
+            "": f"{posterior.count} iterations on {max(detail.grid.shape)} voxels; "
             f"the residual is {posterior.residual:.2f} sigma",
         }
         outcome = Outcome(stopped or "iterations", messages[stopped])

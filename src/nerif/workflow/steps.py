@@ -22,7 +22,7 @@ from nerif.geometry import Grid
 from nerif.imaging.calibration.cameras_file import CalibratedCamera, write_cameras
 from nerif.physics.quantities import NOT_UNIFORM, masked_lines
 from nerif.reconstruction.base import Reconstruction, compose
-from nerif.reconstruction.detail import COARSE, ITERATIONS, SIGNIFICANT, UNRESOLVED, Choice, Detail, choose
+from nerif.reconstruction.detail import COARSE, ITERATIONS, SIGNIFICANT, Choice, Detail, choose
 from nerif.reconstruction.files import FIELD, checkpoints
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.rig.parameters import refinement_lines, with_corrections
@@ -170,10 +170,6 @@ class AddDetail(PipelineStep):
         job.out.write_field(result)  # an interruption loses nothing of the fit
         with job.monitor.counting("adding detail") as bar:
             posterior = choice.solve(fine, coarse, lambda p: bar(p.count, ITERATIONS))
-        if posterior.residual > UNRESOLVED and job.run.detail == "auto":
-            left = f"{posterior.residual:.1f} of {before:.1f} sigma remain with it, so the flow varies within a pixel"
-            job.monitor.say(f"detail left out: {left}")
-            return
         job.posterior = posterior
         job.detail_entries = {
             "residual_before": before, "residual_after": posterior.residual, "withheld_before": choice.before,

@@ -104,7 +104,7 @@ class Descent:
             sigma = (settings.pose_sigma_mm, settings.pose_sigma_deg, settings.shift_sigma_px)
             self.rig = Refinement.for_measurement(measurement, settings.refine, *sigma)
         # the weight is searched for on the last grid but one and corrected on the last; or else searched for at the end
-        self.search_levels = [first - 1, first if first and start is None else len(self.levels) - 1]
+        self.search_levels = [first - 1, first if first else len(self.levels) - 1]
         self.weight = settings.weight
         self.guess: float | None = None
         self.reason = ""

@@ -69,11 +69,19 @@ class Prior:
 
 
 class WhiteProblem(Problem):
-    """A least-squares problem in the white noise z of a prior, with the data that a mean field leaves."""
+    """A least-squares problem in the white noise z of a prior, with the data that a mean field leaves.
 
-    def __init__(self, problem: Problem, prior: Prior, mean: Float[Tensor, "z y x"]) -> None:
+    Parameters
+    ----------
+    problem : of the field
+    prior : of what the mean leaves
+    mean : scaled coefficients
+    ratio : of the errors of the data to their noise
+    """
+
+    def __init__(self, problem: Problem, prior: Prior, mean: Float[Tensor, "z y x"], ratio: float = 1.0) -> None:
         super().__init__(problem.operators, problem.target)
-        self.problem, self.prior, self.mean = problem, prior, mean
+        self.problem, self.prior, self.mean, self.ratio = problem, prior, mean, ratio
         self.data = problem.data - problem.forward(mean)
 
     def forward(self, x: Float[Tensor, "z y x"]) -> Float[Tensor, " n"]:
@@ -88,9 +96,9 @@ class WhiteProblem(Problem):
 
     @property
     def variance(self) -> float:
-        """The mean square noise v of a number of the data."""
+        """The mean square error v of a number of the data."""
         assert self.target.noise is not None
-        return self.target.noise / self.target.numbers
+        return self.ratio**2 * self.target.noise / self.target.numbers
 
     def fits(self) -> WhiteProblem:
         """Return the problem with the size of the prior that explains what the data have above their noise."""
@@ -100,7 +108,11 @@ class WhiteProblem(Problem):
         noise = self.variance * self.target.numbers
         excess = max(float(self.data.square().sum()) - noise, MIN_EXCESS * noise)
         factor = math.sqrt(excess / predicted) if predicted > 0 else 1.0
-        return WhiteProblem(self.problem, self.prior.times(factor), self.mean)
+        return WhiteProblem(self.problem, self.prior.times(factor), self.mean, self.ratio)
+
+    def with_errors(self, ratio: float) -> WhiteProblem:
+        """Return the problem of data whose errors have that ratio to their noise."""
+        return WhiteProblem(self.problem, self.prior, self.mean, ratio)
 
     def solve(self) -> Iterator[Iterate]:
         """Yield iterates z towards the posterior mean, without end."""
@@ -110,7 +122,7 @@ class WhiteProblem(Problem):
         """Yield approximations x of a draw from the posterior, whose mean is at z, without end."""
         start = self._white(generator)
         noise = torch.randn(self.data.shape, generator=generator).to(self.data) * math.sqrt(self.variance)
-        moved = WhiteProblem(self.problem, self.prior, self.mean)
+        moved = self.with_errors(self.ratio)
         moved.data = noise - self.forward(start)
         moved.__dict__["response"] = self.response
         for iterate in moved.solve():
