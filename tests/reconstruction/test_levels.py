@@ -120,7 +120,7 @@ def test_a_search_for_the_weight_is_the_same_after_a_pause(flame):
     first = method(flame, start=start, on_step=lambda step: step.step == 8)
     again = method(flame, resume=first.state)
     assert "; weight" in whole.outcome.message
-    assert first.history[-1]["bin_edge"] == 1
+    assert first.history[-1]["bin_edge"] > 1  # the search is under way
     assert again.outcome.reason == whole.outcome.reason
     assert again.history[-1]["weight"] == pytest.approx(whole.history[-1]["weight"], rel=0.05)
 

@@ -7,22 +7,28 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
+import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from torch import Tensor
 
 from nerif.data.measurement import Measurement
-from nerif.data.volume import Volume, describe
+from nerif.data.volume import Volume, describe, name_of
 from nerif.fields.base import Field
 from nerif.geometry import Box, Grid
 from nerif.geometry.symmetry import Axis
 from nerif.reconstruction.rig.parameters import RefinedView
 
+if TYPE_CHECKING:
+    import xarray as xr
+    from matplotlib.figure import Figure
+
 __all__ = ["OnStep", "Outcome", "Reconstruction", "Reconstructor", "State", "Step", "compose"]
 
+VOXELS = 100  # of a volume along the longest edge
 NOTEBOOK_VOXELS = 48  # along the longest edge
 MISFITS = {  # columns of a history, the most informative first
     "residual_over_sigma": "times the noise, rms over the training views",
@@ -97,7 +103,7 @@ def compose(*callbacks: OnStep) -> OnStep:
     return lambda step: any([bool(callback(step)) for callback in callbacks])  # noqa: C419 (a generator would skip some)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Reconstruction:
     """The result of a reconstruction.
 
@@ -134,15 +140,33 @@ class Reconstruction:
         """Name of the forward model."""
         return str(self.settings["model"])
 
-    def volume(self, grid: Grid) -> Volume:
-        """Return the field at the voxel centres of a grid."""
+    def volume(self, grid: Grid | int = VOXELS) -> Volume:
+        """Return the field at the voxel centres of a grid, or of one with that many along the longest edge."""
+        grid = grid if isinstance(grid, Grid) else Grid.of_resolution(self.box, grid)
         return Volume.of(self.field.sample(grid, self.device), grid, self.quantity, self.n_ambient)
+
+    def to_xarray(self, grid: Grid | int = VOXELS) -> xr.DataArray:
+        """Return the volume on a grid with coordinates x, y, z in mm, unit and attributes."""
+        return self.volume(grid).to_xarray()
+
+    def plot(self, grid: Grid | int = VOXELS) -> Figure:
+        """Return a figure of the three middle slices."""
+        return self.volume(grid).plot()
+
+    def write(self, path: str | os.PathLike[str], grid: Grid | int = VOXELS, force: bool = False) -> None:
+        """Write the volume in the format of the ending of a file (.vti, .nc, .npz, .mat, .csv)."""
+        self.volume(grid).write(path, force)
+
+    def __repr__(self) -> str:
+        x, y, z = self.box.edges
+        about = f"{name_of(self.quantity)} in {x:g} x {y:g} x {z:g} mm by a {type(self.field).__name__}"
+        return f"<Reconstruction of {about}; {self.outcome.reason} after {self.seconds:.1f} s on {self.device}>"
 
     def _repr_html_(self) -> str:
         """Notebook display: the three middle slices, outcome, time and misfit."""
         from nerif.plotting.notebook import number, panel, show_slices
 
-        volume = self.volume(Grid.of_resolution(self.box, NOTEBOOK_VOXELS))
+        volume = self.volume(NOTEBOOK_VOXELS)
         rows = [("Outcome", f"{self.outcome.reason.replace('_', ' ')}: {self.outcome.message}")]
         rows.append(("Time", f"{self.seconds:.0f} s on {self.device}"))
         last = self.history[-1] if self.history else {}

@@ -60,7 +60,7 @@ ITERATIONS, CONVERGED = 30, 0.03
 """Of conjugate gradients, at most, and the relative fall of the objective at which they end (docs/decisions/057)."""
 TRIAL_ITERATIONS = 6
 """Of a trial: the coarse grid predicts no better with more, which fit what it cannot represent."""
-DRAW_ITERATIONS = 12
+DRAW_ITERATIONS, DRAWS = 12, 3  # DRAWS: for the size of the error of a prediction
 SIGNIFICANT = 1.1  # sigma: residual above which there is detail
 EXPLAINED = 0.7  # of the signal of the field's own detail
 BETTER = 0.99  # of the error of a prediction, at most
@@ -121,11 +121,21 @@ class Posterior:
 
     def error(self, seed: int, on_iteration: Callable[[int, int], None] = lambda done, total: None) -> Field:
         """Return a draw of the error: the difference between a draw from the posterior and its mean."""
+        return self._splines(self._error(seed, on_iteration))
+
+    def error_of(self, target: Target) -> float:
+        """Return the rms error of the prediction of other views over sigma that draws predict."""
+        squares = [self.detail.prediction_square(target, self._error(seed), measured=False) for seed in range(DRAWS)]
+        return math.sqrt(sum(squares) / DRAWS)
+
+    def _error(
+        self, seed: int, on_iteration: Callable[[int, int], None] = lambda done, total: None
+    ) -> Float[Tensor, "z y x"]:
         draw, draws = self.coefficients, self.problem.draw(self.iterate.x, torch.Generator().manual_seed(seed))
         for i in range(DRAW_ITERATIONS):
             draw = next(draws)
             on_iteration(i + 1, DRAW_ITERATIONS)
-        return self._splines(draw - self.coefficients)
+        return draw - self.coefficients
 
     def _splines(self, coefficients: Float[Tensor, "z y x"]) -> Field:
         scaled = coefficients * self.detail.problem.scale
@@ -234,7 +244,7 @@ class Detail:
         return 1 - left / blurred if blurred > 0 else 1.0
 
     def solve(self, problem: WhiteProblem, watch: Watch | None = None, iterations: int = ITERATIONS) -> Posterior:
-        """Return the posterior, after so many iterations at most."""
+        """Return the posterior after at most some iterations."""
         last = math.inf
         for i, iterate in zip(range(iterations), problem.solve(), strict=False):
             pause()
@@ -279,9 +289,18 @@ class Detail:
 
     def prediction_error(self, target: Target, coefficients: Float[Tensor, "z y x"]) -> float:
         """Return the rms residual of other views over sigma."""
-        squares = [part.residual(self.problem.predict(part, part.rays, coefficients)) for part in target.parts]
-        total = sum(float(r.square().sum()) for r in squares)
-        return math.sqrt(total * target.chi_square / target.numbers)
+        return math.sqrt(self.prediction_square(target, coefficients))
+
+    def prediction_square(
+        self, target: Target, coefficients: Float[Tensor, "z y x"], measured: bool = True
+    ) -> float:  # fmt: skip
+        """Return the mean square of the residual of other views over sigma, or of the prediction itself."""
+        total = 0.0
+        for part in target.parts:
+            predicted = self.problem.predict(part, part.rays, coefficients)
+            residual = part.residual(predicted) if measured else predicted * part.inverse_scale
+            total += float(residual.square().sum())
+        return total * target.chi_square / target.numbers
 
     def _blurred(self, values: Float[Tensor, "z y x"], width: float) -> Float[Tensor, "z y x"]:
         from scipy.ndimage import gaussian_filter
@@ -328,6 +347,15 @@ class Choice:
             if self.passes or second.objective < first.objective:
                 problem = fine.like(second.problem, self.blurred)
         return fine.posterior(problem or fine.first(self.blurred), watch)
+
+    def error_ratio(self, coarse: Detail, withheld: Measurement) -> float:
+        """Return the error of the prediction of the withheld views over the one that draws predict."""
+        target, problem = coarse.others(withheld), coarse.first(self.blurred)
+        if self.passes == 2:
+            problem = coarse.next(coarse.solve(problem))
+        posterior = coarse.posterior(problem)
+        square = coarse.prediction_square(target, posterior.coefficients) - 1
+        return math.sqrt(max(square, 0.0)) / posterior.error_of(target)
 
 
 def choose(

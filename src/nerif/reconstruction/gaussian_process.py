@@ -75,7 +75,8 @@ class GaussianProcess(SharedSettings):
             size = float(max(posterior.detail.grid.shape))
             record = {"residual_over_sigma": posterior.residual, "objective": posterior.objective, "voxels": size}
             history.append({"step": history[-1]["step"] + 1, "seconds": now, **record})
-            done = (posterior.count + self.iterations * (posterior.detail.coarse == 1)) / (2 * self.iterations)
+            on_this = sum(1 for record in history if record.get("voxels") == size and "objective" in record)
+            done = (min(1.0, on_this / (2 * self.iterations)) + (posterior.detail.coarse == 1)) / 2
             rays = len(posterior.problem.target) * posterior.count / max(now, 1e-9)
             count, state = int(history[-1]["step"]), first.state
             assert state is not None

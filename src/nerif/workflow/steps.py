@@ -99,18 +99,26 @@ class ChooseDetail(PipelineStep):
         choice = ChooseDetail.choice(job, most)
         if choice is not None:
             each = choice.seconds or (most if math.isfinite(most) else 0.0)
-            job.budget = job.budget.holding(min(each * (1 + job.trials.members), most))
+            draws = job.trials.members if choice.blurred else 0
+            job.budget = job.budget.holding(min(each * (1 + draws), most))
         job.detail = choice
+
+    @staticmethod
+    def coarse(job: Job) -> Detail | None:
+        """Return the detail of the field of the cross-validation, on a coarse grid; None without that field."""
+        if job.validation is None or not job.out.cross_validation.has(FIELD):
+            return None
+        settings, training = job.reconstructor, job.validation.training
+        assert isinstance(settings, SharedSettings)
+        return Detail(job.out.cross_validation.field()[0], training, settings, axis_of(settings, training), COARSE)
 
     @staticmethod
     def choice(job: Job, most: float) -> Choice | None:
         """Return how detail is added, or None; `most`: seconds that are left for it."""
-        validation, settings, on = job.validation, job.reconstructor, job.run.detail == "on"
-        assert isinstance(settings, SharedSettings)
-        if validation is None or not job.out.cross_validation.has(FIELD):
+        validation, on = job.validation, job.run.detail == "on"
+        coarse = ChooseDetail.coarse(job)
+        if validation is None or coarse is None:
             return Choice() if on else None
-        axis = axis_of(settings, validation.training)
-        coarse = Detail(job.out.cross_validation.field()[0], validation.training, settings, axis, COARSE)
         if coarse.residual < SIGNIFICANT and not on:
             return None
         with job.monitor.counting("choosing the detail") as bar:
@@ -140,7 +148,7 @@ class Fit(PipelineStep):
             if job.on_step is not None:
                 callbacks.append(job.on_step)
             initial = job.initial if job.state is None else None
-            trials = 0 if job.detail is not None else job.trials.members
+            trials = 0 if job.detail is not None and job.detail.blurred else job.trials.members
             method = job.budget.allot(job.method, 1 / (1 + trials))
             job.result = method(job.inputs.training, compose(*callbacks), job.state, initial)
 
@@ -286,22 +294,29 @@ class WriteAxis(PipelineStep):
 
 
 class DrawErrors(PipelineStep):
-    """Add standard deviations to the volumes, from draws of the posterior of the detail."""
+    """Add standard deviations to the volumes, from draws of the posterior of the detail.
+
+    They are scaled by the errors of the prediction of the withheld view. About a field that is not blurred they do not
+    contain the errors of the field itself: the bootstrap does.
+    """
 
     sections = ("uncertainty",)
 
     @staticmethod
     def wanted(job: Job) -> bool:
-        return bool(job.trials.members) and job.posterior is not None
+        return bool(job.trials.members) and has_error_draws(job)
 
     @staticmethod
     def run(job: Job) -> None:
         assert job.posterior is not None
         begin, deviations = time.monotonic(), Deviations(job.quantities[0], job.run.gas.for_field(job.quantities[0]))
-        grid = Grid.of_resolution(job.measurement.box, VOXELS)
+        grid, ratio = Grid.of_resolution(job.measurement.box, VOXELS), 1.0
+        if job.detail is not None and job.validation is not None and (coarse := ChooseDetail.coarse(job)) is not None:
+            with job.monitor.counting("errors of the withheld view"):
+                ratio = job.detail.error_ratio(coarse, job.validation.withheld)
         for number in range(1, job.trials.members + 1):
             with job.monitor.counting(f"draw {number} of {job.trials.members}") as bar:
-                deviations.add(job.posterior.error(number, bar).sample(grid), grid)
+                deviations.add(ratio * job.posterior.error(number, bar).sample(grid), grid)
         about: dict[str, Any] = {"kind": job.run.uncertainty, "source": "posterior", "diverged_trials": []}
         about["seconds"] = time.monotonic() - begin
         write_deviations(job.out, job.monitor, job.quantities, deviations, about)
@@ -315,7 +330,7 @@ class Bootstrap(PipelineStep):
     @staticmethod
     def wanted(job: Job) -> bool:
         interrupted = the_result(job).outcome.reason == "interrupted"
-        return bool(job.trials.members) and job.posterior is None and not interrupted
+        return bool(job.trials.members) and not has_error_draws(job) and not interrupted
 
     @staticmethod
     def run(job: Job) -> None:
@@ -369,6 +384,11 @@ STEPS: tuple[type[PipelineStep], ...] = (
 )  # fmt: skip
 CLOSING: tuple[type[PipelineStep], ...] = (Judge, WriteReport)
 """Run whatever became of the others, if there is a field."""
+
+
+def has_error_draws(job: Job) -> bool:
+    """Whether standard deviations are drawn from the posterior of the detail."""
+    return job.posterior is not None and job.posterior.blurred
 
 
 def the_result(job: Job) -> Reconstruction:

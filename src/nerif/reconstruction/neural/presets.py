@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
+from typing import Any
+
 import torch
 
 from nerif.common.conventions import InputError
+from nerif.common.files import check_known
 from nerif.fields.network import NetworkShape
 from nerif.reconstruction.neural.losses import LossWeights
 from nerif.reconstruction.neural.neural import NeRIF
@@ -42,10 +46,11 @@ PRESETS: dict[str, NeRIF] = {
 }
 
 
-def preset(name: str) -> NeRIF:
-    """Return the settings of a preset; "auto" is `best` with a GPU, else `fast`."""
+def preset(name: str, **changes: Any) -> NeRIF:
+    """Return the settings of a preset, with changes such as max_steps=500; "auto" is `best` with a GPU, else `fast`."""
     if name == "auto":
         name = "best" if torch.cuda.is_available() else "fast"
     if name not in PRESETS:
         raise InputError(f"expected auto, {', '.join(PRESETS)}, got '{name}'", field="preset")
-    return PRESETS[name]
+    check_known(changes, [f.name for f in dataclasses.fields(NeRIF)], "preset")
+    return dataclasses.replace(PRESETS[name], **changes)

@@ -50,8 +50,7 @@ if TYPE_CHECKING:
 __all__ = ["Descent"]
 
 PIXELS = 1 << 16  # about as many, whose residual is computed where a level has bins: to half a per cent
-COARSE_TOLERANCE = 10  # times the tolerance, for weights of a search and for solutions that are only a start
-EARLY_TOLERANCE = 100  # times the tolerance, the same for methods without a penalty
+COARSE_TOLERANCE = 10  # times the tolerance, for weights of a search
 SEARCH = 8  # solutions of a search for the weight on one grid, about
 REFINEMENT_WEIGHT = 0.1 * COARSE_WEIGHT  # while a rig is refined and no weight is chosen yet
 ROUNDS = 20  # refinements of a rig on a level
@@ -140,7 +139,6 @@ class Descent:
     def _descend(self) -> bool:
         """Solve on all levels; return whether the last solution has converged."""
         last = len(self.levels) - 1
-        coarse = EARLY_TOLERANCE if self.settings.weight == 0.0 else COARSE_TOLERANCE
         for level in range(self.level, last + 1):
             if level > self.level:
                 self.level, self.round, self.iteration = level, 0, 0
@@ -151,7 +149,8 @@ class Descent:
             self.checkpoint = self._capture()
             if self.weight is None and level in self.search_levels:
                 x = self._choose(problem, x)
-            _, converged = self._solve(problem, x, self._weight_or(COARSE_WEIGHT), 1 if level == last else coarse)
+            factor = 1 if level == last else self.settings.coarse
+            _, converged = self._solve(problem, x, self._weight_or(COARSE_WEIGHT), factor)
         return converged
 
     @property

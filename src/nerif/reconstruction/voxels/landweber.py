@@ -12,6 +12,7 @@ from typing import ClassVar
 from torch import Tensor
 
 from nerif.common.conventions import InputError
+from nerif.common.settings import NonNegative
 from nerif.reconstruction.voxels.operator import operator_norm
 from nerif.reconstruction.voxels.problem import Iterate, Problem
 from nerif.reconstruction.voxels.settings import VoxelReconstructor
@@ -31,10 +32,13 @@ class Landweber(VoxelReconstructor):
     """
 
     title: ClassVar[str] = "Landweber"
+    coarse: ClassVar[float] = 3
     momentum: bool = True
     """Nesterov's momentum: the same accuracy in far fewer iterations."""
     relaxation: float = 1.0
     """Step omega in units of 1 / |F|^2; below 2 (1 with momentum)."""
+    tolerance: NonNegative = 3e-3
+    """Convergence criterion: relative decrease of the objective per iteration, averaged over several."""
     iterations: int = 200
     """Maximum iterations on each grid."""
 

@@ -9,7 +9,7 @@ import math
 from abc import abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import torch
 from annotated_types import Ge, Lt
@@ -40,6 +40,8 @@ MIN_VOXELS = 8  # along the longest edge in the cross-validation run
 class VoxelReconstructor(SharedSettings):
     """Settings of every voxel method."""
 
+    coarse: ClassVar[float] = 100
+    """Times the tolerance, for solutions that are only a start."""
     voxels: Count = 64
     """Voxels along the longest edge of the box, in the reconstruction and in the written volume."""
     basis: Literal["linear", "cubic"] = "cubic"
@@ -123,6 +125,7 @@ class VoxelReconstructor(SharedSettings):
 class WeightedVoxelReconstructor(VoxelReconstructor):
     """Settings of the methods with a penalty."""
 
+    coarse: ClassVar[float] = 10
     regularisation: Literal["auto"] | Annotated[float, Ge(0), Lt(math.inf)] = "auto"
     """Regularisation weight, or auto (discrepancy principle where sigma is known, else L-curve)."""
 
