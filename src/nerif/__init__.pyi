@@ -33,6 +33,7 @@ from .reconstruction.voxels.multiplicative import MLEM as MLEM
 from .reconstruction.voxels.tikhonov import Tikhonov as Tikhonov
 from .reconstruction.voxels.total_variation import TotalVariation as TotalVariation
 from .results.directory import ResultDirectory as ResultDirectory
+from .results.read import read as read
 from .simulation.simulate import Simulation as Simulation
 from .simulation.simulate import add_noise as add_noise
 from .simulation.simulate import simulate as simulate

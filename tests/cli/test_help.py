@@ -6,7 +6,7 @@ import re
 
 import pytest
 
-from nerif.cli.cli import main
+from nerif.cli.cli import COMMANDS, main
 from nerif.cli.commands.help import GROUPS
 from nerif.reconstruction.methods import METHODS
 
@@ -37,3 +37,14 @@ def test_a_setting_by_name(measurement, tmp_path, capsys):
     for wrong in ("network.width", "=3", "network.breadth=3"):
         assert main([*words, "--force", "--set", wrong]) == 2
     assert "did you mean" in capsys.readouterr().err.splitlines()[-1]
+
+
+@pytest.mark.parametrize("command", [c for c in COMMANDS if c not in ("reconstruct", "sequence")])
+def test_every_option_is_explained(command, capsys):
+    assert main([command, "--help"]) == 0
+    text = re.sub("[│╭╮╰╯─|+]|-{5,}", " ", capsys.readouterr().out)
+    options = re.split(r"\n\s+(?=-\w|--\w)", text)[1:]
+    assert options
+    for option in options:
+        explained = re.sub(r"--?[\w.-]+|\b[A-Z]+\b|None|\{.*?\}|\(default.*|\(required.*", "", " ".join(option.split()))
+        assert re.search("[a-z]{2}", explained), option

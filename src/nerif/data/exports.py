@@ -29,10 +29,14 @@ PROGRAMS = ("astra", "tigre")
 """Programs for whose geometry there is an export."""
 
 
-def export(path: str | os.PathLike[str], volumes: list[Volume]) -> None:
-    """Write volumes on one grid in the format of the ending of `path`, one of FORMATS."""
+def export(path: str | os.PathLike[str], volumes: list[Volume], force: bool = False) -> None:
+    """Write volumes on one grid in the format of the ending of `path`, one of FORMATS; over a file with `force`."""
     if ending(path) not in FORMATS:
         raise InputError(f"expected a name ending in {', '.join(FORMATS)}, got '{Path(path).suffix}'", field=path)
+    if not volumes:
+        raise InputError("expected at least one volume, got none", field="volumes")
+    if Path(path).exists() and not force:
+        raise InputError("exists already and was left as it is; give another name, or force=True", field=path)
     FORMATS[ending(path)](path, volumes)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -132,7 +133,7 @@ def _arguments(maps: Mapping[str, Tensor]) -> dict[str, Any]:
     return {"displacement": plain.pop("displacement", None), "sigma": plain.pop("sigma", None), "maps": plain}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Measurement:
     """Cameras, their maps, and the box to reconstruct.
 
@@ -436,11 +437,13 @@ class Measurement:
                 block[row, column] = keep
                 yield rays, keep
 
-    def select(self, names: Sequence[str]) -> Measurement:
-        """Return the measurement of some views, in their order here."""
-        for name in names:
-            if name not in self.names:
-                raise InputError(f"expected one of {', '.join(self.names)}, got '{name}'", field="view")
+    def __getitem__(self, names: str | Sequence[str]) -> Measurement:
+        """Return the measurement of a view, or of some."""
+        return self.select(names)
+
+    def select(self, names: str | Sequence[str]) -> Measurement:
+        """Return the measurement of a view, or of some in their order here."""
+        names = self._views(names, "view")
         index = [i for i, name in enumerate(self.names) if name in names]
         if not index:
             raise InputError(f"expected at least one of {', '.join(self.names)}, got none", field="view")
@@ -460,6 +463,19 @@ class Measurement:
             flow_mask=pick(self.flow_mask),
         )
 
+    def _views(self, names: str | Sequence[str], field: str) -> tuple[str, ...]:
+        """Return names of views, or a single one, if they exist."""
+        if not isinstance(names, str) and not (isinstance(names, Sequence) and all(isinstance(n, str) for n in names)):
+            remedy = "; measurement.names has them by number"
+            raise InputError(f"expected names of views, such as '{self.names[0]}', got {names!r}{remedy}", field=field)
+        names = (names,) if isinstance(names, str) else tuple(names)
+        for name in names:
+            if name not in self.names:
+                nearest = difflib.get_close_matches(name, self.names, n=1)
+                guess = f"; did you mean '{nearest[0]}'?" if nearest else ""
+                raise InputError(f"expected views out of {', '.join(self.names)}, got '{name}'{guess}", field=field)
+        return names
+
     def _cameras_of(self, views: Sequence[int]) -> tuple[Camera, ...]:
         """Return the cameras of some views, without backgrounds if none of the views has data that need one."""
         cameras = tuple(self.cameras[i] for i in views)
@@ -468,11 +484,13 @@ class Measurement:
             return cameras
         return tuple(c if c.background is None else c.without_background for c in cameras)
 
-    def without(self, withheld: Sequence[str]) -> Measurement:
+    def drop(self, *names: str) -> Measurement:
+        """Return the measurement without some views."""
+        return self.without(names)
+
+    def without(self, withheld: str | Sequence[str]) -> Measurement:
         """Return the measurement of the other views."""
-        for name in withheld:
-            if name not in self.names:
-                raise InputError(f"expected views out of {', '.join(self.names)}, got '{name}'", field="withhold")
+        withheld = self._views(withheld, "withhold")
         training = [name for name in self.names if name not in withheld]
         if not training:
             raise InputError("all views are withheld; leave one to reconstruct from", field="withhold")
@@ -483,6 +501,13 @@ class Measurement:
         from nerif.data.measurement_summary import summary
 
         return summary(self, withheld)
+
+    def __repr__(self) -> str:
+        (views, rows, columns), (x, y, z) = self.shape, self.box.edges
+        kinds = ", ".join(o.technique.name for o in self.observations)
+        sigma = "known" if all(o.sigma is not None for o in self.observations) else "unknown"
+        views_of = f"{views} view{'s' * (views > 1)} of {rows} x {columns} px ({', '.join(self.names)})"
+        return f"<Measurement of {kinds}: {views_of}, sigma {sigma}; box of {x:g} x {y:g} x {z:g} mm>"
 
     def _repr_html_(self) -> str:
         from nerif.data.measurement_summary import as_html

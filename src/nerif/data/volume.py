@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
 from nerif.common.axis_order import order_remedy
 from nerif.common.conventions import STATISTICS, InputError, ambient_index
 from nerif.geometry import Grid
+
+if TYPE_CHECKING:
+    import xarray as xr
+    from matplotlib.figure import Figure
 
 __all__ = ["INDEX", "QUANTITIES", "Volume", "describe", "field_of", "name_of", "quantities_of"]
 
@@ -53,7 +60,7 @@ def describe(quantity: str) -> tuple[str, str]:
     return QUANTITIES.get(quantity, ("1", quantity))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Volume:
     """One quantity on a voxel grid.
 
@@ -106,6 +113,37 @@ class Volume:
         values = (self.values.double() + (ambient - n_ambient)).float()
         attributes = {**self.attributes, "n_ambient": n_ambient}
         return replace(self, values=values, quantity="index_excess", attributes=attributes)
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        """Return the values (z, y, x) as an array."""
+        return np.array(self.values.cpu().numpy(), dtype=dtype, copy=bool(copy))
+
+    def to_xarray(self) -> xr.DataArray:
+        """Return the values with coordinates x, y, z in mm, unit and attributes."""
+        from nerif.data.volume_file import to_dataset
+
+        dataset = to_dataset([self])
+        return dataset[self.quantity].assign_attrs(dataset.attrs)
+
+    def write(self, path: str | os.PathLike[str], force: bool = False) -> None:
+        """Write a file in the format of its ending (.vti, .nc, .npz, .mat, .csv); over another with `force`."""
+        from nerif.data.exports import export
+
+        export(path, [self], force)
+
+    def plot(self) -> Figure:
+        """Return a figure of the three middle slices."""
+        from nerif.plotting.notebook import figure_of_slices
+
+        return figure_of_slices(self)
+
+    def __repr__(self) -> str:
+        title, values = describe(self.quantity)[1], np.asarray(self)
+        finite = values[np.isfinite(values)]
+        unit = "" if self.unit == "1" else f" {self.unit}"
+        limits = f"{finite.min():.4g} to {finite.max():.4g}{unit}" if finite.size else "masked everywhere"
+        shape, (x, y, z) = " x ".join(map(str, self.grid.shape)), self.grid.box.edges
+        return f"<Volume {self.quantity}: {title}, {limits}; {shape} voxels (z, y, x), {x:g} x {y:g} x {z:g} mm>"
 
     def summary(self) -> list[tuple[str, str]]:
         """Return names and values with units of a short description."""

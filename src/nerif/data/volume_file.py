@@ -22,7 +22,7 @@ from nerif.geometry import Box, Grid
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["REFERENCES", "read_volume", "read_volumes", "write_netcdf"]
+__all__ = ["REFERENCES", "read_volume", "read_volumes", "to_dataset", "write_netcdf"]
 
 CELL_METHODS = {"mean": "mean", "std": "standard_deviation"}  # of CF
 REFERENCES = "Y. He et al., Neural refractive index field, arXiv:2409.14722"
@@ -31,6 +31,14 @@ Content = tuple[dict[str, Tensor], Grid, dict[str, float | str]]  # arrays, grid
 
 def write_netcdf(path: str | os.PathLike[str], volumes: list[Volume]) -> None:
     """Write volumes on one grid to a NetCDF-4 file with CF conventions, coordinates in mm, atomically."""
+    dataset = to_dataset(volumes)
+    encoding = {name: {"zlib": True, "complevel": 4} for name in dataset.data_vars}
+    with atomic(path) as part:
+        dataset.to_netcdf(part, engine="h5netcdf", encoding=encoding)
+
+
+def to_dataset(volumes: list[Volume]) -> xr.Dataset:
+    """Return the variables and attributes of the file of volumes on one grid."""
     from datetime import UTC, datetime
 
     import xarray as xr
@@ -64,8 +72,7 @@ def write_netcdf(path: str | os.PathLike[str], volumes: list[Volume]) -> None:
         "box_lower_mm": list(grid.box.lower),
         "box_upper_mm": list(grid.box.upper),
     }
-    with atomic(path) as part:
-        dataset.to_netcdf(part, engine="h5netcdf", encoding={k: {"zlib": True, "complevel": 4} for k in data})
+    return dataset
 
 
 def _cf(quantity: str, volumes: list[Volume]) -> dict[str, str]:

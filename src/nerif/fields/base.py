@@ -5,11 +5,14 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 
+import numpy as np
 import torch
 from jaxtyping import Float
+from numpy.typing import ArrayLike
 from torch import Tensor
 
 from nerif.common.arrays import Points, Values, Vectors
+from nerif.common.conventions import InputError
 from nerif.common.pauses import pause
 from nerif.geometry import Grid
 
@@ -23,13 +26,22 @@ class Field(ABC):
     def value_and_gradient(self, points: Points) -> tuple[Values, Vectors]:
         """Return the index excess (1) and its gradient (1/mm) at points (mm)."""
 
-    def __call__(self, points: Points) -> Values:
+    def value(self, points: Points) -> Values:
         """Return the index excess (1) at points (mm)."""
         return self.value_and_gradient(points)[0]
 
-    def gradient(self, points: Points) -> Vectors:
-        """Return the gradient of the index (1/mm) at points (mm)."""
-        return self.value_and_gradient(points)[1]
+    def __call__(self, points: Points | ArrayLike) -> Values:
+        """Return the index excess (1) at points (mm), a tensor, an array or lists."""
+        if isinstance(points, Tensor):
+            return self.value(points)
+        with torch.no_grad():
+            return self.value(_tensor(points))
+
+    def gradient(self, points: Points | ArrayLike) -> Vectors:
+        """Return the gradient of the index (1/mm) at points (mm), a tensor, an array or lists."""
+        if isinstance(points, Tensor):
+            return self.value_and_gradient(points)[1]
+        return self.value_and_gradient(_tensor(points))[1].detach()
 
     def to(self, device: torch.device | str) -> Field:
         """Return the field on a device; itself if its parameters follow the points."""
@@ -41,6 +53,13 @@ class Field(ABC):
         field, points = self.to(device), grid.points().reshape(-1, 3)
         values = [field(p.to(device)).cpu().to(torch.float32) for p in in_chunks(points)]
         return torch.cat(values).reshape(grid.shape)
+
+
+def _tensor(points: ArrayLike) -> Points:
+    array = np.asarray(points, dtype=np.float32)
+    if array.shape[-1:] != (3,):
+        raise InputError(f"expected x, y, z in mm along the last axis, got shape {array.shape}", field="points")
+    return torch.from_numpy(array)
 
 
 def in_chunks(points: Tensor, size: int = 1 << 13) -> Iterator[Tensor]:

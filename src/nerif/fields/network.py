@@ -335,6 +335,6 @@ class NeuralField(Field):
         gradient = gradient * (self.scale / self.half_edge)
         return value.reshape(points.shape[:-1]), gradient.reshape(points.shape)
 
-    def __call__(self, points: Points) -> Values:
+    def value(self, points: Points) -> Values:
         value = self.network(self.normalise(points.reshape(-1, 3)))
         return (self.scale * (value - self.offset)).reshape(points.shape[:-1])

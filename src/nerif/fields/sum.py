@@ -24,5 +24,5 @@ class SumField(Field):
         values, gradients = zip(*(part.value_and_gradient(points) for part in self.parts), strict=True)
         return torch.stack(values).sum(dim=0), torch.stack(gradients).sum(dim=0)
 
-    def __call__(self, points: Points) -> Values:
+    def value(self, points: Points) -> Values:
         return torch.stack([part(points) for part in self.parts]).sum(dim=0)

@@ -107,6 +107,21 @@ class Grid:
         n = self.shape[2 - i]
         return self.box.lower[i] + (torch.arange(n, dtype=dtype) + 0.5) * self.spacing[i]
 
+    @property
+    def x(self) -> Float[Tensor, " x"]:
+        """Voxel-centre coordinates along x, mm."""
+        return self.axis("x")
+
+    @property
+    def y(self) -> Float[Tensor, " y"]:
+        """Voxel-centre coordinates along y, mm."""
+        return self.axis("y")
+
+    @property
+    def z(self) -> Float[Tensor, " z"]:
+        """Voxel-centre coordinates along z, mm."""
+        return self.axis("z")
+
     def points(self, dtype: torch.dtype = torch.float32) -> Float[Tensor, "z y x 3"]:
         """Return voxel centres, mm."""
         z, y, x = torch.meshgrid(self.axis("z"), self.axis("y"), self.axis("x"), indexing="ij")

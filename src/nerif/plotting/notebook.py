@@ -27,8 +27,9 @@ from nerif.plotting.drawing import (
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["image", "number", "panel", "percent", "show_slices", "show_views", "span"]
+__all__ = ["figure_of_slices", "image", "number", "panel", "percent", "show_slices", "show_views", "span"]
 
+SLICES = (8.5, 2.8)  # inches
 VIEWS = 9  # to draw at most, evenly spaced
 PIXELS = 120  # along an edge of a view, enough at its size on the page
 
@@ -88,12 +89,23 @@ def image(draw: Callable[[Figure], object], width: float, height: float, size: f
 def show_slices(volume: Drawable) -> str:
     """Return the three middle slices of a volume as a data URL of a PNG."""
 
-    def draw(figure: Figure) -> None:
-        line = list(figure.subplots(1, 3))
-        draw_slices(line, volume, colour_range(plotted_values(volume)))
-        add_colour_bar(line, label_of(volume.quantity))
+    return image(lambda figure: _draw_slices(figure, volume), *SLICES)
 
-    return image(draw, 8.5, 2.8)
+
+def figure_of_slices(volume: Drawable) -> Figure:
+    """Return the three middle slices of a volume as a figure of pyplot."""
+    from matplotlib import pyplot
+
+    with style(8.0):
+        figure = pyplot.figure(figsize=SLICES, layout="constrained")
+        _draw_slices(figure, volume)
+    return figure
+
+
+def _draw_slices(figure: Figure, volume: Drawable) -> None:
+    line = list(figure.subplots(1, 3))
+    draw_slices(line, volume, colour_range(plotted_values(volume)))
+    add_colour_bar(line, label_of(volume.quantity))
 
 
 def show_views(

@@ -27,25 +27,22 @@ MASKED, GREY = "masked", "#BEBEBE"
 
 @dataclass(frozen=True)
 class Movie:
-    """Settings of a movie.
-
-    Parameters
-    ----------
-    style : isosurface or slices (three, through the centre of the box)
-    quantity : drawn; "" for density or, of another field than the index, the field
-    level : of the isosurface, in the plotted unit; None for halfway between the ambient and the extreme
-    size : width and height, px
-    azimuth, elevation : of the viewpoint, degrees
-    frames_per_second : of the movie
-    """
+    """Settings of a movie."""
 
     style: Literal["isosurface", "slices"] = "isosurface"
+    """Isosurface, or three slices through the centre of the box."""
     quantity: str = ""
+    """Quantity to draw (default: density or, of another field than the index, the field)."""
     level: float | None = None
+    """Value of the isosurface, in the plotted unit (default: halfway between the ambient and the extreme)."""
     size: tuple[int, int] = (960, 720)
+    """Width and height, px."""
     azimuth: float = 35.0
+    """Direction of the viewpoint around z, degrees."""
     elevation: float = 20.0
+    """Height of the viewpoint, degrees."""
     frames_per_second: float = 20.0
+    """Frames per second of the movie."""
 
     def __post_init__(self) -> None:
         check_settings(self)

@@ -201,7 +201,7 @@ class ResultDirectory:
         """Write volume.nc and volume.vti."""
         for name in (VOLUME, VOLUME_VTI):
             with self.writing(name) as path:
-                export(path, volumes)
+                export(path, volumes, force=True)
 
     def write_meridian(self, meridian: Meridian) -> None:
         """Write meridian.nc and meridian.csv."""

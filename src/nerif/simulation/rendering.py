@@ -75,20 +75,16 @@ class Texture:
 
 @dataclass(frozen=True)
 class Sensor:
-    """A sensor: photons to counts.
-
-    Parameters
-    ----------
-    bits : of the counts, 8 to 16
-    exposure : share of full scale of white paper
-    full_well : electrons at full scale, which determine the shot noise; 0 for none
-    read_noise : standard deviation, electrons
-    """
+    """A sensor: photons to counts."""
 
     bits: Annotated[int, Ge(8), Le(16)] = 12
+    """Bits of the counts, 8 to 16."""
     exposure: Positive = 0.8
+    """Share of full scale of white paper."""
     full_well: NonNegative = 10000.0
+    """Electrons at full scale, which determine the shot noise (0: none)."""
     read_noise: NonNegative = 10.0
+    """Standard deviation of the read noise, electrons."""
 
     def __post_init__(self) -> None:
         check_settings(self)

@@ -71,7 +71,7 @@ def run(settings: Export) -> None:
         reconstruction = Volume.of(field.sample(grid), grid, quantity, n_ambient)
         gas = settings.gas.of(result.settings())
         volumes = [derive(reconstruction, q, gas) for q in quantities]
-        export(settings.out, volumes)
+        export(settings.out, volumes, settings.force)
     say(f"{settings.out}: {', '.join(quantities)} on {' x '.join(map(str, grid.shape))} voxels (z, y, x)")
     for line in masked_lines(volumes):
         say(line)
