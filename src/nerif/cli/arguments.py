@@ -6,6 +6,7 @@ nerif.cli.arguments` writes it from the settings. What is not refused here, the 
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import re
@@ -121,7 +122,7 @@ def flag_value(arguments: list[str], *flags: str) -> str | None:
 
 def _options(words: list[str]) -> Iterator[tuple[str, str | None]]:
     """Yield the options among words, each with its first value."""
-    for word, after in zip(words, [*words[1:], ""], strict=True):
+    for word, after in itertools.pairwise([*words, ""]):
         if match := re.fullmatch(r"(--[a-z][\w.-]*)(?:=(.*))?", word, re.DOTALL):
             value = match[2] if match[2] is not None else after
             yield match[1], None if match[2] is None and (not after or after.startswith("--")) else value

@@ -65,7 +65,7 @@ SIGNIFICANT = 1.1  # sigma: residual above which there is detail
 EXPLAINED = 0.7  # of the signal of the field's own detail
 BETTER = 0.99  # of the error of a prediction, at most
 TRIALS = 4  # blurred or not, in one pass or two
-FINE_COST = 28.0  # seconds that detail takes over those of a trial
+FINE_COST, BLURRED_COST = 28.0, 45.0  # seconds that detail takes over those of a trial; about a blurred field
 
 Watch = Callable[["Posterior"], bool | None]
 """Called after each iteration; returns True to stop."""
@@ -376,7 +376,8 @@ def choose(
         posterior, error = coarse.trial(problem, target)
         if error < best.after:
             best = replace(best, blurred=blurred, passes=passes, after=error)
-        best = replace(best, seconds=FINE_COST * (time.perf_counter() - start) / trial)
+        cost = BLURRED_COST if best.blurred else FINE_COST
+        best = replace(best, seconds=cost * (time.perf_counter() - start) / trial)
         on_done(trial, TRIALS)
         if trial > 1 and best.seconds > most:  # the first takes longer
             break

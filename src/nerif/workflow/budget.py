@@ -67,6 +67,11 @@ class Budget:
         """Time until the limit, less the reserve; inf without a limit, s."""
         return self.start + self.limit - self.reserve - time.time() if self.limit else math.inf
 
+    @property
+    def over(self) -> bool:
+        """Whether the limit has passed."""
+        return bool(self.limit) and time.time() > self.start + self.limit
+
     def allot(self, reconstructor: R, share: float = 1.0) -> R:
         """Return settings with a share of the time that is left for fits; unchanged without a limit."""
         if not self.limit:

@@ -39,7 +39,7 @@ from nerif.workflow.reports import write_report
 
 __all__ = ["CLOSING", "STEPS", "PipelineStep"]
 
-MOST_DETAIL = 0.5  # of the time that is left
+MOST_DETAIL = 0.7  # of the time that is left
 
 
 class PipelineStep(ABC):
@@ -177,7 +177,7 @@ class AddDetail(PipelineStep):
         job.begin()
         job.out.write_field(result)  # an interruption loses nothing of the fit
         with job.monitor.counting("adding detail") as bar:
-            posterior = choice.solve(fine, coarse, lambda p: bar(p.count, ITERATIONS))
+            posterior = choice.solve(fine, coarse, lambda p: bar(p.count, ITERATIONS) or job.budget.over)
         job.posterior = posterior
         job.detail_entries = {
             "residual_before": before, "residual_after": posterior.residual, "withheld_before": choice.before,
