@@ -119,6 +119,23 @@ def test_errors_are_drawn_as_large_as_they_are(posterior, plume, seed):
     assert 0.6 < ratio < 1.6
 
 
+def test_data_that_err_by_more_than_sigma_are_not_fitted_down_to_it(plume):
+    truth, measurement = plume
+    optimistic = replace(measurement, sigma=measurement.sigma / 5)
+    detail = Detail(smoothed(truth, 1.5), optimistic, SETTINGS)
+    plain, posterior = detail.solve(detail.first(False)), detail.posterior(detail.first(False))
+    assert posterior.problem.ratio == pytest.approx(plain.residual)
+    assert plain.residual > 2
+    assert error(posterior.field, truth) < 0.98 * error(plain.field, truth)
+
+
+def test_a_solution_is_stopped(plume):
+    truth, measurement = plume
+    coarse, fine = (Detail(smoothed(truth, 1.5), measurement, SETTINGS, coarse=size) for size in (COARSE, 1))
+    stopped = Choice(passes=1).solve(fine, coarse, lambda posterior: True)
+    assert (stopped.count, stopped.problem.ratio) == (1, 1.0)
+
+
 def test_a_flow_through_lenses():
     truth = TurbulentPlume(BOX, seed=9, shortest=0.07)
     measurement = seen(truth, views=5, pixels=24, f_number=8.0)
