@@ -36,6 +36,7 @@ __all__ = [
 ]  # fmt: skip
 
 CHECKPOINT = "checkpoint.safetensors"
+VERSION = 1  # of the field file
 
 
 def fingerprint(measurement: Measurement, open_faces: tuple[str, ...] = ()) -> dict[str, str]:
@@ -102,7 +103,8 @@ def digest(parts: Iterable[Any]) -> str:
 
 def write_field(directory: Path, result: Reconstruction) -> None:
     """Write a field atomically, with everything needed to evaluate it."""
-    about = {"n_ambient": result.n_ambient, "outcome": vars(result.outcome), "quantity": result.quantity}
+    about = {"version": VERSION, "n_ambient": result.n_ambient, "outcome": vars(result.outcome)}
+    about |= {"quantity": result.quantity}
     tensors, entries = _entries_of(result.field)
     _save(directory / FIELD, tensors, {**about, "box": [result.box.lower, result.box.upper], **entries})
 
@@ -140,6 +142,11 @@ def read_field(directory: Path) -> tuple[Field, Box, float]:
         what = "the directory has no" if directory.is_dir() else "no such directory with a"
         raise InputError(f"expected a reconstruction, but {what} {FIELD}; run nerif reconstruct first", field=directory)
     tensors, about = _load(path)
+    if about.get("version", 1) != VERSION:
+        raise InputError(
+            f"expected version {VERSION} of fields, got {about['version']}; read it with a later version of nerif",
+            field=path,
+        )
     try:
         lower, upper = about["box"]
         box = Box(tuple(lower), tuple(upper))
