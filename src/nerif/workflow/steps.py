@@ -39,7 +39,7 @@ from nerif.workflow.reports import write_report
 
 __all__ = ["CLOSING", "STEPS", "PipelineStep"]
 
-MOST_DETAIL = 0.7  # of the time that is left
+MOST_DETAIL, MOST_BLURRED = 0.35, 0.7  # of the time that is left; where the field is blurred, its training matters less
 
 
 class PipelineStep(ABC):
@@ -95,9 +95,10 @@ class ChooseDetail(PipelineStep):
 
     @staticmethod
     def run(job: Job) -> None:
-        most = MOST_DETAIL * job.budget.left
-        choice = ChooseDetail.choice(job, most)
+        left = job.budget.left
+        choice = ChooseDetail.choice(job, left)
         if choice is not None:
+            most = share(choice) * left
             each = choice.seconds or (most if math.isfinite(most) else 0.0)
             draws = job.trials.members if choice.blurred else 0
             job.budget = job.budget.holding(min(each * (1 + draws), most))
@@ -113,8 +114,8 @@ class ChooseDetail(PipelineStep):
         return Detail(job.out.cross_validation.field()[0], training, settings, axis_of(settings, training), COARSE)
 
     @staticmethod
-    def choice(job: Job, most: float) -> Choice | None:
-        """Return how detail is added, or None; `most`: seconds that are left for it."""
+    def choice(job: Job, left: float) -> Choice | None:
+        """Return how detail is added, or None; `left`: seconds until the limit."""
         validation, on = job.validation, job.run.detail == "on"
         coarse = ChooseDetail.coarse(job)
         if validation is None or coarse is None:
@@ -122,10 +123,10 @@ class ChooseDetail(PipelineStep):
         if coarse.residual < SIGNIFICANT and not on:
             return None
         with job.monitor.counting("choosing the detail") as bar:
-            choice = choose(coarse, validation.withheld, math.inf if on else most, bar)
+            choice = choose(coarse, validation.withheld, math.inf if on else MOST_BLURRED * left, bar)
         errors = f"{choice.before:.2f} sigma without it, {choice.after:.2f} with it"
         job.monitor.say(f"detail: the withheld view is predicted to {errors}")
-        if choice.seconds > most and not on:
+        if choice.seconds > share(choice) * left and not on:
             job.monitor.say(f"detail left out: it takes about {choice.seconds:.0f} s; give a longer --time-limit")
             return None
         return choice if choice.pays or on else None
@@ -384,6 +385,11 @@ STEPS: tuple[type[PipelineStep], ...] = (
 )  # fmt: skip
 CLOSING: tuple[type[PipelineStep], ...] = (Judge, WriteReport)
 """Run whatever became of the others, if there is a field."""
+
+
+def share(choice: Choice) -> float:
+    """Return the largest share of the time left that detail may take."""
+    return MOST_BLURRED if choice.blurred else MOST_DETAIL
 
 
 def has_error_draws(job: Job) -> bool:
