@@ -72,7 +72,7 @@ def main() -> None:
             line += f", error {(A.volume(x).values - exact).norm() / exact.norm():.1%}"
         print(line)
         if words.out:
-            nerif.export(words.out, [A.volume(x)])
+            nerif.export(words.out, [A.volume(x)], force=True)
 
 
 if __name__ == "__main__":

@@ -99,7 +99,7 @@ def test_sources_follow_the_files(folder, tmp_path):
     export(copy / "volume.nc", [still.volume("index_excess")])
     before = Still(copy).limits("index_excess")
     twice = still.volume("index_excess")
-    export(copy / "volume.nc", [Volume.of(2 * twice.values, twice.grid, "index_excess", AMBIENT)])
+    export(copy / "volume.nc", [Volume.of(2 * twice.values, twice.grid, "index_excess", AMBIENT)], force=True)
     assert Still(copy).limits("index_excess")[0] == pytest.approx(2 * before[0])
 
 

@@ -34,7 +34,7 @@ INPUTS = {
     "report": f"{RESULT}, or a store (.zarr) of nerif sequence",
     "figures": RESULT,
     "export": f"{RESULT}, or a measurement (--format astra or tigre)",
-    "app": "no such folder; expected one to work in",
+    "app": "no such folder; expected a folder to work in",
     "info": "no such file or folder; expected a measurement, volume or result",
 }
 """Commands whose first word is a file or folder to read, with the error where it does not exist."""
