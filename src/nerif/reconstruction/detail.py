@@ -61,7 +61,7 @@ ITERATIONS, CONVERGED = 30, 0.03
 TRIAL_ITERATIONS = 6
 """Of a trial: the coarse grid predicts no better with more, which fit what it cannot represent."""
 DRAW_ITERATIONS, DRAWS = 12, 3  # DRAWS: for the size of the error of a prediction
-SIGNIFICANT = 1.1  # sigma: residual above which there is detail
+SIGNIFICANT, EARLY = 1.1, 3.0  # sigma: residual above which there is detail; in a short run, which has not converged
 EXPLAINED = 0.7  # of the signal of the field's own detail
 BETTER = 0.99  # of the error of a prediction, at most
 TRIALS = 4  # blurred or not, in one pass or two

@@ -22,7 +22,7 @@ from nerif.geometry import Grid
 from nerif.imaging.calibration.cameras_file import CalibratedCamera, write_cameras
 from nerif.physics.quantities import NOT_UNIFORM, masked_lines
 from nerif.reconstruction.base import Reconstruction, compose
-from nerif.reconstruction.detail import COARSE, ITERATIONS, SIGNIFICANT, Choice, Detail, choose
+from nerif.reconstruction.detail import COARSE, EARLY, ITERATIONS, SIGNIFICANT, Choice, Detail, choose
 from nerif.reconstruction.files import FIELD, checkpoints
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.rig.parameters import refinement_lines, with_corrections
@@ -120,7 +120,7 @@ class ChooseDetail(PipelineStep):
         coarse = ChooseDetail.coarse(job)
         if validation is None or coarse is None:
             return Choice() if on else None
-        if coarse.residual < SIGNIFICANT and not on:
+        if coarse.residual < EARLY and not on:
             return None
         with job.monitor.counting("choosing the detail") as bar:
             choice = choose(coarse, validation.withheld, math.inf if on else MOST_BLURRED * left, bar)
