@@ -50,6 +50,7 @@ def test_a_volume_is_an_array(result, tmp_path):
     array = np.asarray(volume)
     assert array.shape == volume.grid.shape
     assert np.array(volume, dtype=np.float64).dtype == np.float64
+    assert np.asarray(volume, dtype=np.float64).dtype == np.float64
     assert float(np.max(volume)) == float(volume.values.max())
     labelled = volume.to_xarray()
     assert labelled.dims == ("z", "y", "x")

@@ -116,7 +116,7 @@ class Volume:
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
         """Return the values (z, y, x) as an array."""
-        return np.array(self.values.cpu().numpy(), dtype=dtype, copy=bool(copy))
+        return np.array(self.values.cpu().numpy(), dtype=dtype, copy=copy)
 
     def to_xarray(self) -> xr.DataArray:
         """Return the values with coordinates x, y, z in mm, unit and attributes."""

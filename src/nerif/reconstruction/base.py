@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     import xarray as xr
     from matplotlib.figure import Figure
 
-__all__ = ["OnStep", "Outcome", "Reconstruction", "Reconstructor", "State", "Step", "compose"]
+__all__ = ["VOXELS", "OnStep", "Outcome", "Reconstruction", "Reconstructor", "State", "Step", "compose"]
 
 VOXELS = 100  # of a volume along the longest edge
 NOTEBOOK_VOXELS = 48  # along the longest edge

@@ -349,13 +349,13 @@ class Choice:
         return fine.posterior(problem or fine.first(self.blurred), watch)
 
     def error_ratio(self, coarse: Detail, withheld: Measurement) -> float:
-        """Return the error of the prediction of the withheld views over the one that draws predict."""
+        """Return the error of the prediction of the withheld views over the one that draws predict, at least 1."""
         target, problem = coarse.others(withheld), coarse.first(self.blurred)
         if self.passes == 2:
             problem = coarse.next(coarse.solve(problem))
         posterior = coarse.posterior(problem)
         square = coarse.prediction_square(target, posterior.coefficients) - 1
-        return math.sqrt(max(square, 0.0)) / posterior.error_of(target)
+        return max(1.0, math.sqrt(max(square, 0.0)) / posterior.error_of(target))
 
 
 def choose(

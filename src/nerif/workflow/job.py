@@ -18,7 +18,7 @@ from nerif.data.volume import Volume, quantities_of
 from nerif.fields.base import Field
 from nerif.physics.quantities import GasSettings
 from nerif.reconstruction.aperture import apply_aperture
-from nerif.reconstruction.base import OnStep, Reconstruction, Reconstructor, State, Step
+from nerif.reconstruction.base import VOXELS, OnStep, Reconstruction, Reconstructor, State, Step
 from nerif.reconstruction.detail import Choice, Posterior, check_sigma
 from nerif.reconstruction.files import CHECKPOINT, FIELD
 from nerif.reconstruction.methods import method_name
@@ -37,8 +37,6 @@ from nerif.workflow.budget import Budget
 from nerif.workflow.cross_validation import AUTO, MIN_VIEWS, CrossValidation, with_halves
 
 __all__ = ["Inputs", "Job", "Run", "remedy"]
-
-VOXELS = 100  # of the written volume along the longest edge, for methods without voxels
 
 
 @dataclass(frozen=True)
