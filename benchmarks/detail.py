@@ -43,9 +43,9 @@ LIMITS = {16: 6.0, 100: 60.0}
 def cases(quick: bool) -> Iterator[Settings]:
     flows = [("turbulence", 6, 16, 1)]
     if not quick:
-        flows = [("turbulence", 9, 100, 2), ("fire", 9, 100, 2)]
+        flows = [(phantom, 9, 100, 3) for phantom in ("turbulence", "fire")]
         flows += [(phantom, 9, 100, 1) for phantom in ("flame", "gaussians", "octahedron")]
-        flows += [("turbulence", views, 100, 1) for views in (6, 18)]
+        flows += [(phantom, views, 100, 1) for phantom in ("turbulence", "fire") for views in (6, 18)]
     for phantom, views, pixels, seeds in flows:
         for seed in range(seeds):
             for method, detail in METHODS:
