@@ -59,4 +59,4 @@ study-quick: .venv/.dev
 	touch $@
 
 clean:
-	rm -rf .venv out docs/_build docs/_drawings docs/repository
+	rm -rf .venv out docs/_build docs/_drawings docs/notebooks docs/repository

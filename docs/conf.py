@@ -18,18 +18,29 @@ extensions = [
     "sphinx.ext.autodoc",
     "sphinx.ext.githubpages",
     "sphinx.ext.viewcode",
+    "sphinx_gallery.gen_gallery",
     "docstrings",
     "mathml",
     "figures",
     "repository",
 ]
-exclude_patterns = ["_build", "_drawings", "_extensions"]
+exclude_patterns = ["_build", "_drawings", "_extensions", "tutorials"]
 language = "en_GB"
 smartquotes = False  # -- is an option of the command line
 suppress_warnings = [
     "misc.highlighting_failure",  # TOML with "..." where a matrix stands
     "ref.python",  # two classes of one name, in annotations that are not evaluated
 ]
+
+sphinx_gallery_conf = {  # the notebooks: scripts that run when the site is built
+    "examples_dirs": "tutorials",
+    "gallery_dirs": "notebooks",
+    "filename_pattern": r"\.py$",
+    "within_subsection_order": "FileNameSortKey",
+    "abort_on_example_error": True,
+    "download_all_examples": False,
+    "show_signature": False,
+}
 
 # Markdown: $...$ and $$...$$ (label) for formulas, links to headings of other pages
 myst_enable_extensions = ["dollarmath", "deflist"]

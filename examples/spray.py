@@ -23,6 +23,7 @@ from nerif.reconstruction.base import Reconstruction, Reconstructor
 WITHHELD = (2, 7, 12, 17)
 WEIGHTS = (5e-5, 1e-4, 2e-4, 5e-4, 1e-3, 2e-3, 5e-3)  # of total variation, to choose from
 FOLDS = 5  # of the cross-validation
+ANGLE_DIGITS = 4  # of an angle in degrees; the file has single precision
 WATER = 1006.0  # mm2/g at 8 keV: extinction over density
 
 
@@ -30,7 +31,8 @@ def read(path: Path, name: str) -> LineScan:
     """Return the scan of one of the slices jets, impingement and near."""
     with xr.open_dataset(path, group=name, engine="h5netcdf", phony_dims="sort") as data:
         arrays = (data[key].values.astype(np.float64) for key in ("theta", "x", "ext_length"))
-        return LineScan(*arrays)
+        theta, x, readings = arrays
+        return LineScan(np.radians(np.degrees(theta).round(ANGLE_DIGITS)), x, readings)
 
 
 def reconstruct(
@@ -131,11 +133,20 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=300, help="of training")
     parser.add_argument("--find-axis", action="store_true", help="also by refinement of the rig")
     parser.add_argument("--out", type=Path, default=Path("spray"))
+    parser.add_argument(
+        "--measurement", type=Path, help="NAME.nc: write the corrected scan for nerif reconstruct, and end"
+    )
     options = parser.parse_args()
     methods: dict[str, Reconstructor] = {
         "nerif": NeRIF(max_steps=options.steps, samples=(24, 40)),
     }
     scan, withheld = read(options.data, options.slice), tuple(options.withhold)
+    if options.measurement is not None:
+        estimate = scan.estimate()
+        corrected = scan.without_offset(estimate.offset).corrected(estimate.saturation)
+        corrected.measurement(estimate.axis).write(options.measurement)
+        print(f"{options.measurement}: {estimate}")
+        return
     if options.find_axis:
         at = refined_axis(scan, scan.estimate(), TotalVariation(voxels=40, basis="linear"))
         print(f"axis by refinement of the rig: {at:.3f} mm")

@@ -11,6 +11,7 @@ from .data.exports import export as export
 from .data.exports import export_geometry as export_geometry
 from .data.measurement import Measurement as Measurement
 from .data.reprojection import Reprojection as Reprojection
+from .data.samples import sample as sample
 from .data.volume import Volume as Volume
 from .data.volume_file import read_volume as read_volume
 from .data.volume_file import read_volumes as read_volumes

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from nerif.cli.cli import main
-from nerif.cli.commands import demo
+from nerif.cli.commands import demo, reconstruct, simulate
 from nerif.common.conventions import InputError
 from nerif.common.written_files import WRITTEN, OwnFiles
 from nerif.data.measurement_sequence import MEASUREMENTS, MeasurementSequence, check_store
@@ -150,15 +150,15 @@ def test_the_demo_keeps_a_foreign_measurement(tmp_path, monkeypatch):
     out = tmp_path / "demo"
     put(out / "measurement.nc", "measured in the laboratory")
 
-    def simulate(settings):
-        for path in (settings.out, demo.simulate.truth_path(settings.out)):
-            put(path, "simulated")
+    def write(words):
+        for name in ("measurement.nc", "measurement.truth.nc"):
+            put(out / name, "simulated")
 
-    def stop(settings):
+    def stop(words):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(demo.simulate, "run", simulate)
-    monkeypatch.setattr(demo.reconstruct, "run", stop)
+    monkeypatch.setattr(simulate, "main", write)
+    monkeypatch.setattr(reconstruct, "main", stop)
     for _ in range(2):
         with pytest.raises(KeyboardInterrupt):
             demo.run(demo.Demo(out=out, force=True))

@@ -1,71 +1,167 @@
-"""nerif demo: simulation, reconstruction, evaluation and report of a small flame, with one withheld view."""
+"""nerif demo: from a measurement to a report by the commands of nerif, which are printed: simulated or real data."""
 
 from __future__ import annotations
 
+import importlib
+import shlex
+import webbrowser
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 from annotated_types import Ge
 
-from nerif.cli.commands import evaluate, reconstruct, simulate
-from nerif.cli.commands.output import MONITOR, say
+from nerif.cli.commands.output import say
 from nerif.cli.commands.settings import Settings, command
+from nerif.common.conventions import InputError
 from nerif.common.installation import install
-from nerif.geometry import Ring
-from nerif.reconstruction.neural.neural import NeRIF
-from nerif.results.directory import ResultDirectory
-from nerif.simulation.simulate import Simulation
-from nerif.workflow.job import Run
-from nerif.workflow.reports import write_report
+from nerif.common.written_files import OwnFiles
+from nerif.data.samples import SAMPLES, sample
+from nerif.results.directory import REPORT, ResultDirectory
 
-__all__ = ["Demo", "main", "run"]
+__all__ = ["DEMOS", "Demo", "main", "run"]
 
-WITHHELD_ANGLE = 95.625  # degrees, halfway between the fifth and the sixth of nine views
+
+@dataclass(frozen=True)
+class Stage:
+    """A command of a demo.
+
+    Parameters
+    ----------
+    line : of the command, without `nerif`; {out} is the directory, {steps} the number of training steps
+    files : that it writes beside those of a result
+    """
+
+    line: str
+    files: tuple[str, ...] = ()
+
+    def words(self, out: Path, steps: int) -> list[str]:
+        """Return the words of the command."""
+        return [word.format(out=out, steps=steps) for word in self.line.split()]
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """The commands of a demo, and a number of training steps that suffices."""
+
+    title: str
+    steps: int
+    stages: tuple[Stage, ...]
+
+
+def _one_camera(steps: int, name: str, rig: str, options: str) -> Scenario:
+    """Return the way from the images of one camera to a report."""
+    rig = f"calibrate {{out}} --simple {rig} -o {{out}}/camera.toml --force"
+    return Scenario(
+        f"{SAMPLES[name].title} (real data, {SAMPLES[name].licence})",
+        steps,
+        (
+            Stage(rig, ("camera.toml", "camera.rig.png")),
+            Stage(
+                "displacement {out} --calibration {out}/camera.toml -o {out}/measurement.nc --force",
+                ("measurement.nc", "measurement.png"),
+            ),
+            Stage(
+                "reconstruct {out}/measurement.nc --out {out} --force --max-steps {steps} --symmetry axis " + options
+            ),
+        ),
+    )
+
+
+DEMOS = {
+    "flame": Scenario(
+        "turbulent Bunsen flame, simulated: nine views, and a withheld tenth",
+        700,
+        (
+            Stage(
+                "simulate --phantom flame --image-size 64 64 --pixel-pitch 0.0625 --noise 0.05 --truth-voxels 80 "
+                "--extra-angles 95.625 -o {out}/measurement.nc --force",
+                ("measurement.nc", "measurement.truth.nc"),
+            ),
+            Stage(
+                "reconstruct {out}/measurement.nc --out {out} --force --preset fast --max-steps {steps} "
+                "--withhold 95.625deg --voxels 80 --no-report"
+            ),
+            Stage("evaluate {out} --truth {out}/measurement.truth.nc"),
+            Stage("report {out}"),
+        ),
+    ),
+    "jet": _one_camera(
+        400,
+        "jet",
+        "--distance 1000 --background-distance 300 --mm-per-px 0.1",
+        "--open-faces z- z+ --from displacements",
+    ),
+    "blowtorch": _one_camera(
+        200,
+        "blowtorch",
+        "--distance 1000 --background-distance 300 --mm-per-px 0.1",
+        "--open-faces z- z+ --from displacements",
+    ),
+    "spray": Scenario(
+        f"{SAMPLES['spray'].title} (real data, {SAMPLES['spray'].licence})",
+        300,
+        (Stage("reconstruct {out}/measurement.nc --out {out} --force --max-steps {steps} --samples 24 40"),),
+    ),
+}
 
 
 @dataclass(frozen=True)
 class Demo(Settings):
-    """Simulate nine small views of a flame and a withheld tenth, reconstruct with standard deviations, and evaluate."""
+    """Reconstruct a simulated flame or a real flow that comes with nerif, by the commands that are printed."""
 
-    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("out/demo")
-    """Directory to write."""
-    steps: Annotated[int, Ge(1)] = 700
-    """Training steps of each of three runs: the reconstruction and two bootstrap trials."""
-    pixels: Annotated[int, Ge(8)] = 64
-    """Pixels along an edge of each view (paper: 200)."""
-    noise: float = 0.05
-    """Noise relative to the rms displacement."""
-    seed: int = 0
-    """Random seed of flame, noise and network."""
+    name: Annotated[Literal[*DEMOS], tyro.conf.Positional] = "flame"  # type: ignore[valid-type]
+    """Name of the demo; --list describes them."""
+    out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    """Directory to write (default: out/NAME)."""
+    steps: Annotated[int, Ge(0)] = 0
+    """Training steps (0: as many as the demo needs)."""
+    list: bool = False
+    """List the demos, and end."""
+    open: bool = False
+    """Open the report in the browser at the end."""
     force: bool = False
     """Overwrite an existing directory."""
 
 
 def run(settings: Demo) -> None:
-    """Run the demo and print where its results are."""
-    out = ResultDirectory(settings.out, say)
-    out.check_free(settings.force)
-    settings.out.mkdir(parents=True, exist_ok=True)
-    path, pixels = settings.out / "measurement.nc", settings.pixels
-    truth = simulate.truth_path(path)
-    ring = Ring(extra_angles=(WITHHELD_ANGLE,), image_size=(pixels,) * 2, pixel_pitch=0.02 * 200 / pixels)
-    simulation = Simulation(noise=settings.noise, seed=settings.seed, truth_voxels=80)
-    with out.writing(path.name), out.writing(truth.name):
-        simulate.run(simulate.Simulate(out=path, force=True, simulation=simulation, ring=ring))
-    reconstruct.run(
-        reconstruct.ReconstructNeRIF(
-            measurement=path, out=settings.out, preset="fast", voxels=80, force=True,
-            run=Run(withhold=(f"{WITHHELD_ANGLE:g}deg",), uncertainty="fast", report=False),
-            reconstructor=NeRIF(max_steps=settings.steps, seed=settings.seed),
-        )
-    )  # fmt: skip
-    evaluate.run(evaluate.Evaluate(settings.out, truth=truth))
-    page = write_report(settings.out, monitor=MONITOR)
-    say(f"Report of field, views and estimated error: open {page} in a browser.")
-    say(f"Browser interface: nerif app {settings.out} ({install('app')})")
-    say(f"ParaView: {settings.out}/volume.vti; figures for print: nerif figures {settings.out}")
+    """Run the commands of a demo, and print where the report is and what to try next."""
+    if settings.list:
+        for name, demo in DEMOS.items():
+            say(f"nerif demo {name:<10} {demo.title}")
+        return
+    demo, out = DEMOS[settings.name], settings.out or Path("out") / settings.name
+    directory = ResultDirectory(out, say)
+    directory.check_free(settings.force)
+    out.mkdir(parents=True, exist_ok=True)
+    if settings.name in SAMPLES:
+        sample(settings.name, out)
+    for stage in demo.stages:
+        words = stage.words(out, settings.steps or demo.steps)
+        say(f"\n$ nerif {shlex.join(words)}")
+        with ExitStack() as stack:
+            for file in stage.files:
+                stack.enter_context(OwnFiles(out, say).writing(file))
+            importlib.import_module(f"nerif.cli.commands.{words[0]}").main(words[1:])
+    _print_next(settings.name, out)
+    if settings.open and not webbrowser.open((out / REPORT).resolve().as_uri()):
+        raise InputError("no browser on this machine; open the page above in one", field="open")
+
+
+def _print_next(name: str, out: Path) -> None:
+    other = "flame" if name == "jet" else "jet"
+    commands = {
+        f"nerif figures {shlex.quote(str(out))}": "figures for print, as PDF and PNG",
+        f"nerif app {shlex.quote(str(out))}": f"in the browser ({install('app')})",
+        f"nerif demo {other}": f"{DEMOS[other].title} (nerif demo --list: all)",
+    }
+    say(f"\nReport: {(out / REPORT).resolve().as_uri()}")
+    say("Next:")
+    width = max(map(len, commands))
+    for line, text in commands.items():
+        say(f"  {line:<{width}}  {text}")
 
 
 main = command("demo", Demo, run)
