@@ -136,7 +136,7 @@ def verdict(result: Result) -> Verdict:
     outcome = metrics.outcome
     if outcome in ("diverged", "collapsed"):
         return Verdict.of("do not use", None, [f"the run {outcome}"])
-    views = [v for v in metrics.views if _complete(v)]
+    views = _fitted_quantities(metrics.views, result)
     fitted, withheld = ([v for v in views if bool(v["withheld"]) is role] for role in (False, True))
     for group, role in ((fitted, "training"), (withheld, "withheld")):
         share = _explained(group, _noise(fitted))
@@ -182,6 +182,13 @@ def _percent(share: float) -> str:
 
 def _complete(view: View) -> bool:
     return view["rms_predicted"] > 0 and math.isfinite(view["rms"])
+
+
+def _fitted_quantities(views: Sequence[View], result: Result) -> list[View]:
+    """Return the complete views, without the images of a measurement whose displacements were fitted."""
+    displacements = result.settings.get("source") == "displacements"
+    images = {kind.measured for kind in TECHNIQUES.values() if kind.derived} if displacements else set()
+    return [v for v in views if _complete(v) and v["measured"] not in images]
 
 
 def _quantities(views: Sequence[View]) -> list[str]:
@@ -231,14 +238,15 @@ def _from_views(
 ) -> tuple[Estimate | None, str]:  # fmt: skip
     """The estimate from withheld views, of the whole run else of cross-validation; or None, and why there is none."""
     first = result.metrics.cross_validation
-    first_views, first_fitted = (first["views"], first["fitted_views"]) if first else ([], [])
-    first_fitted = [v for v in first_fitted if _complete(v)]
+    first_views, first_fitted = (
+        _fitted_quantities(first[key] if first else [], result) for key in ("views", "fitted_views")
+    )
     noise = _noise(fitted)
     for views, basis in (
         (withheld, "cross-validated on a withheld view"),
         (first_views, "cross-validated in a first run without a view"),
     ):
-        usable = [v for v in views if _complete(v) and v["measured"] in noise and v["measured"] in _quantities(views)]
+        usable = [v for v in views if v["measured"] in noise and v["measured"] in _quantities(views)]
         if not usable:
             continue
         largest, factor = max(_withheld(v, noise) for v in usable), A_WITHHELD

@@ -60,7 +60,7 @@ def _one_camera(steps: int, name: str, rig: str, options: str) -> Scenario:
         (
             Stage(rig, ("camera.toml", "camera.rig.png")),
             Stage(
-                "displacement {out} --calibration {out}/camera.toml -o {out}/measurement.nc --force",
+                "displacement {out} --calibration {out}/camera.toml -o {out}/measurement.nc --no-images --force",
                 ("measurement.nc", "measurement.png"),
             ),
             Stage(
@@ -81,7 +81,7 @@ DEMOS = {
                 ("measurement.nc", "measurement.truth.nc"),
             ),
             Stage(
-                "reconstruct {out}/measurement.nc --out {out} --force --preset fast --max-steps {steps} "
+                "reconstruct {out}/measurement.nc --out {out} --force --preset fast --precision float32 --max-steps {steps} "
                 "--withhold 95.625deg --voxels 80 --no-report"
             ),
             Stage("evaluate {out} --truth {out}/measurement.truth.nc"),
@@ -92,13 +92,13 @@ DEMOS = {
         400,
         "jet",
         "--distance 1000 --background-distance 300 --mm-per-px 0.1",
-        "--open-faces z- z+ --from displacements",
+        "--open-faces z- z+ --detail off",
     ),
     "blowtorch": _one_camera(
         200,
         "blowtorch",
         "--distance 1000 --background-distance 300 --mm-per-px 0.1",
-        "--open-faces z- z+ --from displacements",
+        "--open-faces z- z+ --detail off",
     ),
     "spray": Scenario(
         f"{SAMPLES['spray'].title} (real data, {SAMPLES['spray'].licence})",
