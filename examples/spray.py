@@ -17,7 +17,7 @@ import numpy as np
 import xarray as xr
 from line_scans import LineScan, ScanEstimate
 
-from nerif import NeRIF, TotalVariation, reproject
+from nerif import Measurement, NeRIF, TotalVariation, reproject
 from nerif.reconstruction.base import Reconstruction, Reconstructor
 
 WITHHELD = (2, 7, 12, 17)
@@ -35,6 +35,11 @@ def read(path: Path, name: str) -> LineScan:
         return LineScan(np.radians(np.degrees(theta).round(ANGLE_DIGITS)), x, readings)
 
 
+def without_sigma(measurement: Measurement) -> Measurement:
+    """Return the measurement with readings of equal weight: sigma is that outside the medium, where it is smallest."""
+    return replace(measurement, maps={"absorbance": measurement.maps["absorbance"]})
+
+
 def reconstruct(
     scan: LineScan, withheld: tuple[int, ...], method: Reconstructor
 ) -> tuple[LineScan, np.ndarray, Reconstruction, ScanEstimate]:
@@ -47,8 +52,7 @@ def reconstruct(
     scan = scan.without_offset(estimate.offset)
     whole = scan.corrected(estimate.saturation).measurement(estimate.axis)
     measurement = whole.select([whole.names[i] for i in training])
-    # without sigma all readings have the same weight
-    result = method(replace(measurement, maps={"absorbance": measurement.maps["absorbance"]}))
+    result = method(without_sigma(measurement))
     predicted = LineScan.saturate(reproject(result.field, whole).predicted[:, 0, :, 0].numpy(), estimate.saturation)
     return scan, predicted, result, estimate
 
@@ -143,8 +147,8 @@ def main() -> None:
     scan, withheld = read(options.data, options.slice), tuple(options.withhold)
     if options.measurement is not None:
         estimate = scan.estimate()
-        corrected = scan.without_offset(estimate.offset).corrected(estimate.saturation)
-        corrected.measurement(estimate.axis).write(options.measurement)
+        corrected = scan.without_offset(estimate.offset).corrected(estimate.saturation).measurement(estimate.axis)
+        without_sigma(corrected).write(options.measurement)
         print(f"{options.measurement}: {estimate}")
         return
     if options.find_axis:
