@@ -56,7 +56,7 @@ def test_pages_of_the_api_tell_of_what_is_there(page: str) -> None:
 def test_site_is_whole_and_loads_nothing_from_the_web(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", "-b", "html"]
     command += ["-d", str(tmp_path / "trees"), str(ROOT / "docs"), str(tmp_path / "html")]
-    result = subprocess.run(command, capture_output=True, text=True, timeout=300, cwd=ROOT)
+    result = subprocess.run(command, capture_output=True, text=True, timeout=900, cwd=ROOT)
     assert result.returncode == 0, result.stdout + result.stderr
     site = (tmp_path / "html").resolve()
     for name in PAGES:

@@ -24,13 +24,21 @@ from nerif.simulation.experiment import Experiment
 folder = Path(tempfile.mkdtemp()) / "experiment"
 box, n_ambient = nerif.Box.cube(50.0), 1.00027
 flame = nerif.make_phantom("flame", box)
-rig = nerif.Ring(views=6, arc=(0, 150), image_size=(96, 96), pixel_pitch=0.042, background_distance=1000)
-experiment = Experiment(poses=20, backgrounds=3)
+rig = nerif.Ring(
+    views=6,
+    arc=(0, 150),
+    image_size=(96, 96),
+    pixel_pitch=0.042,
+    background_distance=1000,
+)
+experiment = Experiment(poses=16, backgrounds=3)
 experiment.write(folder, rig.cameras(), flame, box, n_ambient)
 
 figure, axes = plt.subplots(1, 3, figsize=(9, 3), layout="constrained")
 for ax, kind in zip(axes, ("target", "reference", "flow"), strict=True):
-    ax.imshow(Image.open(sorted((folder / "0deg" / kind).glob("*.tif"))[0]), cmap="gray")
+    ax.imshow(
+        Image.open(sorted((folder / "0deg" / kind).glob("*.tif"))[0]), cmap="gray"
+    )
     ax.set(title=f"0deg/{kind}", xticks=[], yticks=[])
 
 # %%
@@ -48,7 +56,9 @@ settings = CalibrationSettings(world="0", axes=world_axes(rig.cameras()), distor
 target = experiment.target_for(rig.cameras())
 calibration = calibrate_views(views, target, settings, background_scale(rig.cameras()))
 for i, name in enumerate(calibration.names):
-    print(f"{name:>6}  rms {calibration.rms(name):.3f} px, position +- {calibration.sigma_translation[i]:.2f} mm")
+    print(
+        f"{name:>6}  rms {calibration.rms(name):.3f} px, position +- {calibration.sigma_translation[i]:.2f} mm"
+    )
 
 # %%
 # Displacements
@@ -78,15 +88,21 @@ print(result.findings or "No problems found")
 # --------------
 # A short run from the displacements. For your own data use the preset as it is: it ends by convergence, and fits the
 # images themselves where the measurement contains them.
-reconstruction = nerif.preset("fast", max_steps=300, source="displacements")(measurement)
+reconstruction = nerif.preset("fast", max_steps=300, source="displacements")(
+    measurement
+)
 reconstruction
 
 # %%
 # Density
 # -------
 # From the index, by the Gladstone-Dale relation for air.
-density = nerif.derive(reconstruction.volume(64), "density", nerif.GasSettings(composition="air", wavelength_nm=532))
-density.plot()
+density = nerif.derive(
+    reconstruction.volume(64),
+    "density",
+    nerif.GasSettings(composition="air", wavelength_nm=532),
+)
+figure = density.plot()
 
 # %%
 # Against the truth
@@ -94,4 +110,6 @@ density.plot()
 # Only here, as the flame is simulated.
 truth = nerif.read_volume(folder / "truth" / "volume.nc")
 scores = nerif.evaluate_volume(reconstruction.field, truth, n_ambient)
-print(f"L2 {scores['l2']:.2%}, of the variation {scores['l2_variation']:.1%}, CC {scores['cc']:.4f}")
+print(
+    f"L2 {scores['l2']:.2%}, of the variation {scores['l2_variation']:.1%}, CC {scores['cc']:.4f}"
+)

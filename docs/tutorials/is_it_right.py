@@ -11,6 +11,7 @@ agree with each other, is a withheld view predicted, what is the verdict, and ho
 # ----------------------------
 # Nine views of a turbulent flame, one of which was mirrored when its images were copied.
 import tempfile
+import textwrap
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,7 +21,7 @@ import nerif
 
 box, n_ambient = nerif.Box.cube(50.0), 1.00027
 flame = nerif.make_phantom("flame", box, seed=4)
-rig = nerif.Ring(views=9, arc=(0, 160), image_size=(64, 64), pixel_pitch=0.0625)
+rig = nerif.Ring(views=9, arc=(0, 160), image_size=(48, 48), pixel_pitch=0.083)
 right = nerif.simulate(flame, rig.cameras(), box, n_ambient, noise=0.05)
 displacement = right.displacement.clone()
 displacement[3] = displacement[3].flip(1)  # columns reversed, as by a mirror
@@ -47,10 +48,13 @@ print(nerif.check_consistency(measurement).findings or "corrected: No problems f
 # writes a directory with the report. ``uncertainty="fast"`` adds standard deviations.
 folder = Path(tempfile.mkdtemp())
 method = nerif.preset("fast", max_steps=300)
-nerif.reconstruct_into(folder / "result", measurement, method, nerif.Run(uncertainty="fast", report=False), voxels=48)
+run = nerif.Run(uncertainty="fast", report=False)
+nerif.reconstruct_into(folder / "result", measurement, method, run, voxels=48)
 result = nerif.ResultDirectory(folder / "result").read()
-cross_validation = result.metrics.cross_validation
-print({name: cross_validation[name] for name in list(cross_validation)[:6]})
+for view in result.metrics.cross_validation["views"]:
+    print(
+        f"withheld view {view['name']}: CC {view['cc']:.4f}, error {view['rms']:.4f} px"
+    )
 
 # %%
 # The verdict
@@ -59,14 +63,14 @@ print({name: cross_validation[name] for name in list(cross_validation)[:6]})
 # *cannot tell*.
 from nerif.analysis.verdict import verdict
 
-print(verdict(result).sentence)
+print(textwrap.fill(verdict(result).sentence, 80))
 
 # %%
 # Error bars
 # ----------
 # The standard deviation of the index at every voxel.
 deviation = result.volumes["index_excess_std"]
-deviation.plot()
+figure = deviation.plot()
 
 # %%
 # Were they right?

@@ -13,7 +13,7 @@ forty lines.
 # A knife edge in the focus of a second lens (focal length f) cuts off a part of the image of the source; a height a
 # of it passes. A deflection towards the edge or away from it changes the intensity of a pixel,
 #
-# .. math:: \\frac{\\Delta I}{I_0} = \\frac{f}{a} \\int \\frac{1}{n} \\frac{\\partial n}{\\partial x'} \\, \\mathrm{d}s
+# .. math:: \frac{\Delta I}{I_0} = \frac{f}{a} \int \frac{1}{n} \frac{\partial n}{\partial x'} \, \mathrm{d}s
 #
 # with x' across the edge, here horizontal in the image. The model returns quadrature weights for samples along each
 # ray: of the field (``value``) or, as here, of its gradient (``slope``), one row for each channel of the data.
@@ -50,7 +50,9 @@ class KnifeEdge(ForwardModel):
         up = torch.tensor([0.0, 0.0, 1.0]).to(rays.direction)
         across = torch.linalg.cross(rays.direction, up.expand_as(rays.direction))
         across = torch.nn.functional.normalize(across, dim=1)
-        return Weights(step * self.focal_over_height / self.n_ambient, slope=across[:, None])
+        return Weights(
+            step * self.focal_over_height / self.n_ambient, slope=across[:, None]
+        )
 
 
 TECHNIQUES[KnifeEdge.name] = KnifeEdge
@@ -63,7 +65,9 @@ TECHNIQUES[KnifeEdge.name] = KnifeEdge
 from nerif import Simulation
 
 rig = nerif.Ring(views=8, arc=(0, 157.5), image_size=(48, 48), pixel_pitch=0.085)
-measurement, truth = Simulation("gaussians", (KnifeEdge.name,), noise=0.05)(rig.cameras())
+measurement, truth = Simulation("gaussians", (KnifeEdge.name,), noise=0.05)(
+    rig.cameras()
+)
 measurement
 
 # %%
@@ -79,7 +83,9 @@ result
 voxels = nerif.Tikhonov(voxels=40)(measurement)
 for name, reconstruction in (("network", result), ("Tikhonov", voxels)):
     scores = nerif.evaluate_volume(reconstruction.field, truth, measurement.n_ambient)
-    print(f"{name:>9}: error of the variation {scores['l2_variation']:.1%}, CC {scores['cc']:.4f}")
+    print(
+        f"{name:>9}: error of the variation {scores['l2_variation']:.1%}, CC {scores['cc']:.4f}"
+    )
 
 # %%
 # In a file

@@ -81,8 +81,8 @@ DEMOS = {
                 ("measurement.nc", "measurement.truth.nc"),
             ),
             Stage(
-                "reconstruct {out}/measurement.nc --out {out} --force --preset fast --precision float32 --max-steps {steps} "
-                "--withhold 95.625deg --voxels 80 --no-report"
+                "reconstruct {out}/measurement.nc --out {out} --force --preset fast --precision float32 "
+                "--max-steps {steps} --withhold 95.625deg --voxels 80 --no-report"
             ),
             Stage("evaluate {out} --truth {out}/measurement.truth.nc"),
             Stage("report {out}"),
