@@ -174,6 +174,17 @@ def test_a_core_is_left_to_another_program_and_used_again_after_it(machine):
     assert torch.get_num_threads() == 2
 
 
+def test_a_fixed_number_of_threads_is_kept_whatever_the_load(machine):
+    with Cores(CPU):
+        with Cores(CPU, threads=3):
+            assert machine.threads_after(3.0, 0.0, 1.0) == 3
+            with Cores(CPU):
+                assert machine.threads_after(3.0, 0.0, 1.0) == 3
+        assert torch.get_num_threads() == 2
+        assert machine.threads_after(3.0, 0.0, 1.0) == 1
+    assert torch.get_num_threads() == 2
+
+
 def test_threads_are_constant_without_counters(machine, monkeypatch):
     with Cores(CPU):
         machine.silent = True

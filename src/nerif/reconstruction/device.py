@@ -76,21 +76,27 @@ class Cores:
 
     Cores are measured at the pauses of the thread (pauses.py). A nested context leaves that to the outer one, so that
     short computations do not each begin with all threads. For a GPU nothing is measured.
+
+    Parameters
+    ----------
+    device : of the computation
+    threads : fixed number, so that sums are in the same order on every machine; nested contexts keep it; 0: free cores
     """
 
-    def __init__(self, device: torch.device) -> None:
-        self.before = torch.get_num_threads()
-        self.most = min(self.before, _quota()) if device.type == "cpu" else self.before
-        self._measures = device.type == "cpu" and self.most > 1
+    def __init__(self, device: torch.device, threads: int = 0) -> None:
+        self.before, self.fixed = torch.get_num_threads(), threads > 0
+        self.most = threads or (min(self.before, _quota()) if device.type == "cpu" else self.before)
+        self._measures = device.type == "cpu" and self.most > 1 and not self.fixed
         self._next, self._last = 0.0, Used(0.0, 0.0, 0.0, 0.0)
         self._calm, self._patience, self._raised = 0, CALM, False
         self._stack = ExitStack()
 
     def __enter__(self) -> Cores:
-        if getattr(_here, "cores", None) is None:
+        outer = getattr(_here, "cores", None)
+        if outer is None or self.fixed:
             _here.cores = self
             self._stack.callback(_set, self.before)
-            self._stack.callback(setattr, _here, "cores", None)
+            self._stack.callback(setattr, _here, "cores", outer)
             self._stack.enter_context(at_pauses(self.look))
             _set(self.most)
             self._measure(FIRST_SECONDS)
@@ -101,7 +107,7 @@ class Cores:
 
     def look(self) -> None:
         """Adapt the number of threads to the load since the last measurement, if that is due."""
-        if not self._measures or time.perf_counter() < self._next:
+        if not self._measures or _here.cores is not self or time.perf_counter() < self._next:
             return
         last = self._last
         self._measure(SECONDS)

@@ -6,7 +6,9 @@ import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
+
+from annotated_types import Ge
 
 from nerif.analysis.asymmetry import halved
 from nerif.analysis.gains import fit_gains, with_gains
@@ -60,6 +62,9 @@ class Run:
     """Write report.html at the end."""
     checkpoint_every: float = 60.0
     """Interval between checkpoints in seconds."""
+    threads: Annotated[int, Ge(0)] = 0
+    """Threads on a CPU (0: as many as there are free cores). With a fixed number, runs without a time limit have the
+    same result to the last digit."""
     gas: GasSettings = field(default_factory=GasSettings)
     """Gas for density and temperature."""
 

@@ -55,11 +55,11 @@ def reconstruct_into(
     live : write live.json and live.npz during the run (results/live.py)
     since : time from which the time limit counts, s since the epoch; None for now
     """
-    out, jobs = ResultDirectory(directory, monitor.say), list[Job]()
+    out, jobs, run = ResultDirectory(directory, monitor.say), list[Job](), run or Run()
     own_files = lambda: resume or any(job.begun for job in jobs)  # noqa: E731
-    with Cores(torch.device("cpu")), if_interrupted(lambda: remedy(out, own_files())):
+    with Cores(torch.device("cpu"), run.threads), if_interrupted(lambda: remedy(out, own_files())):
         job = Job(
-            out, measurement, reconstructor, run or Run(), voxels=voxels, resume=resume, force=force, keep=keep,
+            out, measurement, reconstructor, run, voxels=voxels, resume=resume, force=force, keep=keep,
             on_step=on_step, monitor=monitor, live=live, since=since,
         )  # fmt: skip
         jobs.append(job)

@@ -72,17 +72,17 @@ def _one_camera(steps: int, name: str, rig: str, options: str) -> Scenario:
 
 DEMOS = {
     "flame": Scenario(
-        "turbulent Bunsen flame, simulated: nine views, and a withheld tenth",
-        700,
+        "turbulent Bunsen flame, simulated: twelve views, and a withheld thirteenth",
+        400,
         (
             Stage(
-                "simulate --phantom flame --image-size 64 64 --pixel-pitch 0.0625 --noise 0.05 --truth-voxels 80 "
-                "--extra-angles 95.625 -o {out}/measurement.nc --force",
+                "simulate --phantom flame --views 12 --image-size 48 48 --pixel-pitch 0.0833 --noise 0.05 "
+                "--truth-voxels 80 --extra-angles 100.5 -o {out}/measurement.nc --force",
                 ("measurement.nc", "measurement.truth.nc"),
             ),
             Stage(
-                "reconstruct {out}/measurement.nc --out {out} --force --preset fast --precision float32 "
-                "--max-steps {steps} --withhold 95.625deg --voxels 80 --no-report"
+                "reconstruct {out}/measurement.nc --out {out} --force --preset fast --precision float32 --threads 1 "
+                "--max-steps {steps} --withhold 100.5deg --voxels 80 --no-report"
             ),
             Stage("evaluate {out} --truth {out}/measurement.truth.nc"),
             Stage("report {out}"),
