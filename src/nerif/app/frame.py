@@ -13,6 +13,7 @@ from pathlib import Path
 from nicegui import ui
 
 from nerif.app.elements import dialog, refusals, text_html
+from nerif.app.guide import guide
 from nerif.app.jobs import REFUSED, Job
 from nerif.app.result_volumes import film_progress
 from nerif.app.workspace import READ_ONLY, Workspace
@@ -93,6 +94,7 @@ def frame(work: Workspace, page: Page, pages: Sequence[Page]) -> Iterator[None]:
         ui.html(f"<h1>{escape(page.title)}</h1><p class=lead>{escape(page.about)}</p>", sanitize=False)
         if not work.project.writable:
             ui.html(f"<ul class=notes><li role=status>{READ_ONLY}</li></ul>", sanitize=False)
+        guide(work, page, pages)
         yield
 
 
