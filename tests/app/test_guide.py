@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from app.serving import Served, opened, served
+from app.test_accessibility import CUT, PHONE, RULES, axe, metrics, settled
 from app.test_check_and_masks import click
 from app.test_results import result, tab
 from nerif.app import demo
@@ -204,6 +205,23 @@ def test_hints_are_hidden_recalled_and_fill_in_values(browser, server):
     click(browser, "Show the guide")
     wait_for(browser, "return document.querySelector('.guide').checkVisibility()")
     assert errors(browser) == []
+
+
+@needs_browser
+@pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
+def test_a_hint_breaks_no_rule_on_a_phone(browser, server, dark):
+    scheme = [{"name": "prefers-color-scheme", "value": "dark" if dark else "light"}]
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": scheme})
+    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics(*PHONE))
+    opened(browser, server, "displacement", f"{STATUS} === 'First complete the step Calibration.'")
+    settled(browser)
+    browser.execute_script(axe())
+    assert list(browser.execute_async_script(RULES)) == []
+    assert browser.execute_script(CUT) == []
+    covered = browser.execute_script("return document.querySelector('nav').getBoundingClientRect().right")
+    assert covered <= 0  # the navigation does not lie over the page
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
+    browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
 
 
 @needs_browser

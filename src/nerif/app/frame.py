@@ -76,12 +76,13 @@ def frame(work: Workspace, page: Page, pages: Sequence[Page]) -> Iterator[None]:
         menu = ui.button(icon="menu").props('flat round aria-label="Pages"')
         ui.html(
             f"<span class=brand>nerif</span><span class=project title='{escape(str(work.project.folder))}'>"
-            f"{escape(str(work.project.folder))}</span>", sanitize=False,
+            f"<span class=parent>{escape(str(work.project.folder).removesuffix(work.project.name))}</span>"
+            f"{escape(work.project.name)}</span>", sanitize=False,
         ).classes("where")  # fmt: skip
         ui.space()
         drawer = JobsDrawer(work)
         _switch(dark)
-    with ui.left_drawer(value=True, bordered=True).props("width=208 breakpoint=900").classes("side") as left:
+    with ui.left_drawer(value=None, bordered=True).props("width=208 breakpoint=900").classes("side") as left:
         menu.on_click(left.toggle)
         links = "".join(
             f"<li><a href='{p.path}'{' aria-current=page' if p is page else ''}>"

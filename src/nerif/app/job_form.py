@@ -101,9 +101,9 @@ class JobStatus:
         self.work, self.name, self.job = work, name, str(work.draft(name).get("job", ""))
         self._on_end, self._on_continue, self._lines = on_end, on_continue, {"done": lines, "failed": 30}
         self._content: tuple[str, ...] = ()
-        self.place = ui.element("div").props("role=status aria-live=polite")
-        self.further = ui.element("div")
         with ui.element("div"):
+            self.place = ui.element("div").props("role=status aria-live=polite")
+            self.further = ui.element("div")
             ui.timer(EVERY, self._look)
 
     def follow(self, job: Job) -> None:

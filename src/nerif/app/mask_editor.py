@@ -222,12 +222,13 @@ class MaskEditor:
         height, width = shape
         with ui.element("div").classes("stack").on("keydown", self._key, js_handler=KEYS):
             with ui.element("div").classes("numbers"):
-                tool = ui.toggle(TOOLS).props('no-caps aria-label="Tool"')
-                effect = ui.toggle(EFFECTS).props('no-caps aria-label="Effect of the shape"')
-                size = ui.number("Width of the brush", min=1, step=1, suffix="px").props("outlined dense")
-                size.props["aria-label"] = "Width of the brush (px)"
-            for control, value in ((tool, "tool"), (effect, "inside"), (size, "width")):
-                control.bind_value(brush, value)
+                tool = ui.toggle(TOOLS, value=brush.tool).props('no-caps aria-label="Tool"')
+                tool.on_value_change(lambda event: setattr(brush, "tool", event.value))
+                self._effect = ui.toggle(EFFECTS, value=brush.inside).props('no-caps aria-label="Effect of the shape"')
+                self._effect.on_value_change(lambda event: setattr(brush, "inside", event.value))
+                self._size = ui.number("Width of the brush", value=brush.width, min=1, step=1, suffix="px")
+                self._size.props("outlined dense").props["aria-label"] = "Width of the brush (px)"
+                self._size.on_value_change(lambda event: setattr(brush, "width", event.value))
             with ui.element("div").classes("cropper").on("pointerdown", self._stroke, js_handler=STROKE) as self._place:
                 self._place.style(f"aspect-ratio: {width / height:.4f}; --aspect: {width / height:.4f}")
                 self._place.props('tabindex=0 role=group aria-keyshortcuts="[ ] E Control+Z Control+Shift+Z"')
@@ -273,8 +274,9 @@ class MaskEditor:
         """Do what a key of KEYS stands for."""
         if event.args in ("smaller", "larger"):
             self.brush.resize(event.args == "larger", max(self.shape))
+            self._size.set_value(self.brush.width)
         elif event.args == "effect":
-            self.brush.inside = not self.brush.inside
+            self._effect.set_value(not self.brush.inside)
         elif event.args == "undo" and self.corners:  # of the polygon that is not closed yet
             self.corners.pop()
             self.show()
