@@ -12,6 +12,7 @@ import pytest
 from app.serving import Served, opened, served
 from app.test_accessibility import CUT, PHONE, RULES, axe, metrics, settled
 from app.test_check_and_masks import click
+from app.test_jobs import until
 from app.test_results import result, tab
 from nerif.app import demo
 from nerif.app.forms import Form
@@ -62,10 +63,10 @@ def renders(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
     """Folders that would have been rendered into."""
     folders: list[Path] = []
 
-    def render(settings: Any) -> None:
-        (settings.out / "truth").mkdir(parents=True, exist_ok=True)
-        (settings.out / "truth" / "calibration.toml").write_text("")
-        folders.append(settings.out)
+    def render(folder: Path) -> None:
+        (folder / "truth").mkdir(parents=True, exist_ok=True)
+        (folder / "truth" / "calibration.toml").write_text("")
+        folders.append(folder)
 
     monkeypatch.setattr(demo, "render", render)
     return folders
@@ -83,7 +84,7 @@ def test_a_new_folder_is_filled_once(tmp_path, renders, capsys):
 
 
 def test_a_start_that_was_interrupted_is_repeated(tmp_path, renders, monkeypatch):
-    def interrupted(settings: Any) -> None:
+    def interrupted(folder: Path) -> None:
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
@@ -162,7 +163,8 @@ def test_progress_follows_the_files_and_the_runs(tmp_path):
     assert sentence("results") == "First complete the step Reconstruct."
     job = work.jobs.add(["calibrate", "images"], "calibrate")
     assert sentence("calibration").startswith("In progress")
-    work.jobs.stop(job.id)
+    until(work.jobs, job.id, "failed")  # there are no images
+    assert sentence("calibration").startswith("The last run failed")
     write_cameras(folder / "calibration.toml", [CalibratedCamera.from_camera(camera) for camera in cameras()])
     assert sentence("calibration") == "Done."
     assert progress_of(work).is_ready("calibration")
@@ -312,7 +314,7 @@ def walk(driver: Any, server: Served, note: Any) -> None:
     done(driver, 10)
     note("Check")
     follow(driver, "Reconstruct")
-    fill_in(driver, "--max-steps 300")
+    fill_in(driver, "--max-steps 200")
     click(driver, "Start")
     done(driver, 120)
     wait_for(driver, "return document.querySelector('section[aria-label=\"The run\"] .status').textContent"

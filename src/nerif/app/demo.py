@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from pathlib import Path
 from typing import Any
 
 from nerif.app.project import OWN
-from nerif.cli.commands.output import say
-from nerif.cli.commands.render import Render
-from nerif.cli.commands.render import run as render
-from nerif.common.conventions import InputError
+from nerif.cli.commands.output import counting_bar, say
+from nerif.common.conventions import AMBIENT_INDEX, InputError
 from nerif.common.files import write_json
-from nerif.geometry import Ring
+from nerif.common.interruption import if_interrupted
+from nerif.fields.phantoms import make_phantom
+from nerif.geometry import Box, Ring
 from nerif.simulation.experiment import Experiment
 
 __all__ = ["EDGE", "FOLDER", "IMAGES", "RIG", "fill", "is_demo"]
@@ -20,6 +21,7 @@ __all__ = ["EDGE", "FOLDER", "IMAGES", "RIG", "fill", "is_demo"]
 FOLDER, IMAGES = Path("nerif-demo"), "images"
 MARK = f"{OWN}/demo.json"
 EDGE = 50.0  # of the box of the flow, mm
+TRUTH_VOXELS = 48
 RIG: dict[str, Any] = {
     "views": 6, "arc": (0.0, 150.0), "image_size": (96, 96), "pixel_pitch": 0.043, "background_distance": 1000.0,
 }  # fmt: skip
@@ -48,14 +50,20 @@ def fill(folder: Path) -> None:
     mark.parent.mkdir(parents=True, exist_ok=True)
     write_json(mark, {"complete": False})
     say(f"{folder}: rendering a small experiment, about 10 s")
-    render(
-        Render(
-            out=folder / IMAGES, phantom="flame", box=(EDGE, EDGE, EDGE), truth_voxels=48, force=True,
-            images=Experiment(references=2, poses=10, backgrounds=2), ring=Ring(**RIG),
-        )
-    )  # fmt: skip
+    render(folder / IMAGES)
     (folder / IMAGES / "truth" / "calibration.toml").unlink()  # else pages offer it beside the one to be made
     write_json(mark, {"complete": True})
+
+
+def render(folder: Path) -> None:
+    """Render the images of a flame and of a calibration target."""
+    cameras, box = Ring(**RIG).cameras(), Box.cube(EDGE)
+    experiment = Experiment(references=2, poses=10, backgrounds=2)
+    count = itertools.count(1)
+    remedy = "images are missing; run the same command again"
+    with if_interrupted(lambda: remedy), counting_bar("rendering", experiment.images(len(cameras))) as bar:
+        phantom = make_phantom("flame", box)
+        experiment.write(folder, cameras, phantom, box, AMBIENT_INDEX, TRUTH_VOXELS, lambda: bar(next(count)))
 
 
 def _is_complete(mark: Path) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from html import escape
 from typing import TYPE_CHECKING, Any
@@ -11,7 +11,7 @@ from nicegui import ui
 
 from nerif.app.demo import EDGE, RIG, is_demo
 from nerif.app.elements import refusals
-from nerif.app.project import OWN, Contents
+from nerif.app.project import OWN
 from nerif.app.workspace import Workspace
 from nerif.results.directory import VOLUME
 
@@ -86,7 +86,7 @@ HINTS: dict[str, Hint] = {
         "Fill in the values: a small number of steps, instead of a time limit. Press Start. It takes about a minute.",
         "The loss falls, the predicted view approaches the measured one, and the isosurface becomes a flame.",
         "displacement",
-        {"reconstruct": {"method": "nerif", "preset": "fast", "values": {"max_steps": 300, "voxels": 48}}},
+        {"reconstruct": {"method": "nerif", "preset": "fast", "values": {"max_steps": 200, "voxels": 40}}},
     ),
     "results": Hint(
         "Shows the field with its verdict, compares results, and exports them.",
@@ -98,7 +98,11 @@ HINTS: dict[str, Hint] = {
 }
 """The hint of each page by its name."""
 
-OPEN, RUNNING, DONE = "open", "running", "done"
+OPEN, RUNNING, FAILED, DONE = "open", "running", "failed", "done"
+SENTENCES = {
+    "": "", OPEN: "Not done yet.", RUNNING: "In progress: it continues if you leave the page.",
+    FAILED: "The last run failed; its log is under Runs.", DONE: "Done.",
+}  # fmt: skip
 COMMANDS = {
     "calibration": "calibrate", "displacement": "displacement", "check": "check", "reconstruct": "reconstruct",
 }  # fmt: skip
@@ -112,7 +116,7 @@ class Progress:
 
     Parameters
     ----------
-    states : open, running or done, by the name of the page, for pages whose step has an output
+    states : open, running, failed or done, by the name of the page, for pages whose step has an output
     """
 
     states: Mapping[str, str]
@@ -122,9 +126,7 @@ class Progress:
         before = HINTS[page].before
         if before and self.states[before] != DONE:
             return f"First complete the step {titles[before]}."
-        return {
-            OPEN: "Not done yet.", RUNNING: "In progress: it continues if you leave the page.", DONE: "Done.", "": "",
-        }[self.states.get(page, "")]  # fmt: skip
+        return SENTENCES[self.states.get(page, "")]
 
     def next_page(self, page: str, order: Sequence[str]) -> str:
         """Return the page to go to: the step that comes first, else the next page; empty after the last."""
@@ -141,19 +143,24 @@ class Progress:
 
 def progress_of(work: Workspace) -> Progress:
     """Return how far the steps of a project are."""
-    contents = work.project.contents()
-    running = {job.arguments[0] for job in work.jobs.all() if job.state in ("queued", "running")}
-    outputs: dict[str, Callable[[Workspace, Contents], bool]] = {
-        "calibration": lambda _, files: bool(files.calibrations),
-        "displacement": lambda _, files: bool(files.measurements),
-        "check": lambda work, _: any(work.project.folder.glob(f"{OWN}/checks/*.json")),
-        "reconstruct": lambda work, files: any((work.project.folder / r / VOLUME).is_file() for r in files.results),
-    }
-    states = {
-        page: RUNNING if COMMANDS[page] in running else DONE if is_done(work, contents) else OPEN
-        for page, is_done in outputs.items()
-    }
+    outputs, jobs = _outputs(work), work.jobs.all()  # open runs, then ended ones, the latest first
+    states = {}
+    for page, command in COMMANDS.items():
+        state = next((job.state for job in jobs if job.arguments[0] == command), "")
+        running = state in ("queued", "running", "paused")
+        states[page] = RUNNING if running else DONE if outputs[page] else FAILED if state == "failed" else OPEN
     return Progress(states)
+
+
+def _outputs(work: Workspace) -> dict[str, bool]:
+    """Whether the output of each step is in the project."""
+    contents, folder = work.project.contents(), work.project.folder
+    return {
+        "calibration": bool(contents.calibrations),
+        "displacement": bool(contents.measurements),
+        "check": any((folder / OWN / "checks").rglob("*.json")),
+        "reconstruct": any((folder / name / VOLUME).is_file() for name in contents.results),
+    }
 
 
 def guide(work: Workspace, page: Page, pages: Sequence[Page]) -> None:
