@@ -93,6 +93,8 @@ def test_a_mirrored_view_is_found_and_undone(browser, server, folder):
     opened(browser, server, "check", LINE)
     assert text(browser, 'section[aria-label="Findings"]').endswith("The views have not been compared yet.")
     words = ["check", "bad.nc", "--findings", ".nerif/checks/bad.json"]
+    put(browser, "voxels", "24")  # another test may have left fewer
+    wait_for(browser, f"return {COMPARISON}.endsWith('bad.json')")
     assert line(browser) == ["nerif", *words]
     click(browser, "Compare the views")
     jobs = Jobs(folder)
