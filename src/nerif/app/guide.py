@@ -23,6 +23,7 @@ __all__ = ["HINTS", "Hint", "Progress", "guide", "progress_of"]
 EVERY = 1.5  # seconds
 DRAFT = "guide"
 HALF = EDGE / 2
+SHORT_RUN = {"max_steps": 250, "withhold": ["none"], "voxels": 40}
 
 
 @dataclass(frozen=True)
@@ -79,20 +80,26 @@ HINTS: dict[str, Hint] = {
         "Fill in the values: few voxels, for a quick comparison. Press Compare the views.",
         "All views should agree: an agreement of about 0.7 or more, a gain near 1, and no problems.",
         "displacement",
-        {"check.views": {"voxels": 16}},
+        {"check.views": {"voxels": 12}},
     ),
     "reconstruct": Hint(
         "Fits a field of refractive index to all views at once.",
-        "Fill in the values: a small number of steps, instead of a time limit. Press Start. It takes about a minute.",
+        "Fill in the values: few steps, and no withheld view, to save time. Press Start. It takes about a minute.",
         "The loss falls, the predicted view approaches the measured one, and the isosurface becomes a flame.",
         "displacement",
-        {"reconstruct": {"method": "nerif", "preset": "fast", "values": {"max_steps": 200, "voxels": 40}}},
+        {
+            "reconstruct": {
+                "method": "nerif",
+                "preset": "fast",
+                "values": {"max_steps": 250, "withhold": ["none"], "voxels": 40},
+            }
+        },
     ),
     "results": Hint(
         "Shows the field with its verdict, compares results, and exports them.",
         "Move the sliders of the slices. Then open the tabs In 3-D, Report and Export.",
-        "The verdict states whether the field can be used, and why. With so few steps it asks for care; a longer run "
-        "on the page Reconstruct improves it.",
+        "The verdict states whether the field can be used, and why. This short run asks for care: a longer one with a "
+        "withheld view also estimates the error.",
         "reconstruct",
     ),
 }
