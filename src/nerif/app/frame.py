@@ -124,16 +124,22 @@ class JobsDrawer:
     def build(self) -> None:
         """Build the drawer beside the page."""
         with ui.right_drawer(value=False, bordered=True).props("width=380 overlay").classes("runs") as self.drawer:
-            ui.html("<h2>Runs</h2>", sanitize=False)
+            with ui.element("div").classes("drawer-head"):
+                ui.html("<h2>Runs</h2>", sanitize=False)
+                ui.button(icon="close", on_click=self.drawer.hide).props('flat round dense aria-label="Close the runs"')
             self._at_once = ui.number(
                 "At the same time", value=self.work.jobs.at_once, min=1, max=64, on_change=self._set
             ).props("dense outlined")
             self.place = ui.element("div").props('role="list" aria-label="Runs"')
+        self.drawer.on_value_change(self._on_toggle)
         ui.timer(EVERY, self._refresh)
 
     def toggle(self) -> None:
         """Open or close the drawer."""
         self.drawer.toggle()
+
+    def _on_toggle(self) -> None:
+        """Report the state to screen readers, also after a tap beside the drawer."""
         self.button.props(f"aria-expanded={'true' if self.drawer.value else 'false'}")
 
     def _set(self) -> None:

@@ -105,10 +105,10 @@ HINTS: dict[str, Hint] = {
 }
 """The hint of each page by its name."""
 
-OPEN, RUNNING, FAILED, DONE = "open", "running", "failed", "done"
+OPEN, RUNNING, PAUSED, FAILED, DONE = "open", "running", "paused", "failed", "done"
 SENTENCES = {
     "": "", OPEN: "Not done yet.", RUNNING: "In progress: it continues if you leave the page.",
-    FAILED: "The last run failed; its log is under Runs.", DONE: "Done.",
+    PAUSED: "The run is paused; press Go on.", FAILED: "The last run failed; its log is under Runs.", DONE: "Done.",
 }  # fmt: skip
 COMMANDS = {
     "calibration": "calibrate", "displacement": "displacement", "check": "check", "reconstruct": "reconstruct",
@@ -123,7 +123,7 @@ class Progress:
 
     Parameters
     ----------
-    states : open, running, failed or done, by the name of the page, for pages whose step has an output
+    states : open, running, paused, failed or done, by the name of the page, for pages whose step has an output
     """
 
     states: Mapping[str, str]
@@ -154,8 +154,8 @@ def progress_of(work: Workspace) -> Progress:
     states = {}
     for page, command in COMMANDS.items():
         state = next((job.state for job in jobs if job.arguments[0] == command), "")
-        running = state in ("queued", "running", "paused")
-        states[page] = RUNNING if running else DONE if outputs[page] else FAILED if state == "failed" else OPEN
+        now = {"queued": RUNNING, "running": RUNNING, "paused": PAUSED}.get(state, DONE if outputs[page] else "")
+        states[page] = now or (FAILED if state == "failed" else OPEN)
     return Progress(states)
 
 
