@@ -39,7 +39,7 @@ from report.browsing import errors, needs_browser, text, wait_for
 
 TITLES = {page.name: page.title for page in PAGES}
 ORDER = list(TITLES)
-LONGEST = 300.0  # seconds of the whole walk; 168 beside other work on two cores
+LONGEST = 300.0  # seconds of the whole walk; 122 beside other work on two cores
 LONGEST_RUN = 90.0  # seconds of the reconstruction, without imports and report
 STATUS = "document.querySelector('.guide .status')?.textContent"
 
