@@ -1,4 +1,4 @@
-"""Every page by the rules of axe-core (WCAG 2 A and AA), light and dark, on a laptop and on a large screen.
+"""Every page by the rules of axe-core (WCAG 2 A and AA), light and dark, on a phone, a laptop and a large screen.
 
 The project holds something for each page: images, a calibration, a measurement, results, and a run that is watched.
 """
@@ -26,7 +26,7 @@ from nerif.simulation.simulate import Simulation
 from report.browsing import errors, needs_browser, requests, wait_for
 
 pytestmark = needs_browser
-LAPTOP, LARGE = (1280, 800), (3840, 2160)
+PHONE, TABLET, LAPTOP, LARGE = (390, 844), (1024, 768), (1280, 800), (3840, 2160)
 RULES = """
 const done = arguments[arguments.length - 1];
 axe.run(document, {runOnly: ["wcag2a", "wcag2aa"], resultTypes: ["violations"]}).then(
@@ -44,6 +44,13 @@ THERE = {
     "results": "document.querySelectorAll('.cuts img[src]').length === 3",
 }
 """What a page shows once all of it is there."""
+CUT = """
+const edge = document.documentElement.clientWidth + 1, scrolls = e => getComputedStyle(e).overflowX !== 'visible';
+const inside = e => e.parentElement !== document.body && (scrolls(e.parentElement) || inside(e.parentElement));
+return [...document.querySelectorAll('main *, header *')].filter(e => e.checkVisibility() &&
+  e.getBoundingClientRect().right > edge && !inside(e)).map(e => e.outerHTML.slice(0, 120)).slice(0, 4);
+"""
+"""Elements that reach beyond the right edge of the window: the page hides them where it does not scroll."""
 FOCUS = """
 const e = document.activeElement, own = getComputedStyle(e);
 const box = getComputedStyle(e.closest('.q-field__control') ?? e);
@@ -96,6 +103,9 @@ CASES = [
     pytest.param(LARGE, True, id="4K, dark", marks=pytest.mark.slow),
     pytest.param(LAPTOP, True, id="laptop, dark", marks=pytest.mark.slow),
     pytest.param(LARGE, False, id="4K, light", marks=pytest.mark.slow),
+    pytest.param(PHONE, False, id="phone, light", marks=pytest.mark.slow),
+    pytest.param(PHONE, True, id="phone, dark", marks=pytest.mark.slow),
+    pytest.param(TABLET, True, id="tablet, dark", marks=pytest.mark.slow),
 ]  # fmt: skip
 
 
@@ -105,6 +115,7 @@ def test_a_page_breaks_no_rule_fits_and_asks_nobody_else(browser, server, page, 
     assert seen(browser, server, page, size, dark) == []
     wide = browser.execute_script("return document.documentElement.scrollWidth - document.documentElement.clientWidth")
     assert wide <= 0
+    assert browser.execute_script(CUT) == []
     assert errors(browser) == []
     here = f"http://127.0.0.1:{server.port}/", f"ws://127.0.0.1:{server.port}/"
     assert [address for address in requests(browser) if not address.startswith(here)] == []

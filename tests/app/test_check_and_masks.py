@@ -11,17 +11,21 @@ import pytest
 import torch
 
 from app.serving import opened
-from app.test_pages import put
+from app.test_pages import line, put
+from app.test_results import pick
+from nerif.analysis.consistency_file import read_findings
+from nerif.app.jobs import Job, Jobs
+from nerif.app.mask_editor import Brush
 from nerif.data.measurement import Measurement
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Ring
 from nerif.simulation.simulate import simulate
-from report.browsing import errors, needs_browser, text, wait_for
+from report.browsing import drag, errors, needs_browser, text, wait_for
 
 pytestmark = needs_browser
 
 BOX = Box.cube(50.0)
-COMPARISON = "document.querySelector('[aria-label^=\"The same on\"] .command code').textContent"
+COMPARISON = "document.querySelector('.command code').textContent"
 LINE = "document.querySelector('.command code') !== null"
 
 
@@ -54,11 +58,52 @@ def written(path: Path, seconds: float = 60.0) -> Measurement:
     return Measurement.read(path)
 
 
+def ended(jobs: Jobs, seconds: float) -> Job:
+    """Wait for the end of the last run."""
+    end = time.monotonic() + seconds
+    while (job := jobs.all()[0]).state in ("queued", "running"):
+        assert time.monotonic() < end
+        time.sleep(0.1)
+    return job
+
+
+def test_a_comparison_is_a_run_whose_findings_are_shown_and_go_out_of_date(browser, server, folder):
+    small = Ring(views=3, arc=(0.0, 100.0), image_size=(12, 14), pixel_pitch=0.3).cameras()
+    few = simulate(make_phantom("gaussians", BOX, 1), small, BOX, 1.00027, 0.05, 1, steps=10)
+    few.write(folder / "a <b>.nc")  # the first of the names
+    opened(browser, server, "check", f"{LINE} && {COMPARISON}.includes('a <b>.nc')")
+    put(browser, "voxels", "8")
+    wait_for(browser, f"return {COMPARISON}.endsWith('--voxels 8')")
+    click(browser, "Compare the views")
+    wait_for(browser, "return document.querySelectorAll('.tabled tbody tr').length === 3", 60)
+    assert Jobs(folder).all()[0].title == "Check a <b>.nc"
+    assert read_findings(folder / ".nerif" / "checks" / "a <b>.json").measurement == "a <b>.nc"
+    few.write(folder / "a <b>.nc")
+    opened(browser, server, "check", "document.querySelector('.tabled table') !== null")
+    assert "has changed since this comparison" in text(browser, 'section[aria-label="Findings"]')
+    (folder / ".nerif" / "checks" / "a <b>.json").write_text("no findings")
+    opened(browser, server, "check", LINE)
+    assert "check the measurement again" in text(browser, 'section[aria-label="Findings"]')
+    (folder / "a <b>.nc").unlink()
+    assert errors(browser) == []
+
+
 @pytest.mark.slow
 def test_a_mirrored_view_is_found_and_undone(browser, server, folder):
     opened(browser, server, "check", LINE)
+    assert text(browser, 'section[aria-label="Findings"]').endswith("The views have not been compared yet.")
+    words = ["check", "bad.nc", "--findings", ".nerif/checks/bad.json"]
+    put(browser, "voxels", "24")  # another test may have left fewer
+    wait_for(browser, f"return {COMPARISON}.endsWith('bad.json')")
+    assert line(browser) == ["nerif", *words]
     click(browser, "Compare the views")
-    wait_for(browser, "return document.querySelector('.tabled table') !== null", 120)
+    jobs = Jobs(folder)
+    wait_for(browser, "return document.querySelector('.status').textContent.startsWith('It ')")
+    assert jobs.all()[0].arguments == tuple(words)
+    browser.get("about:blank")  # the run does not depend on the page
+    ended(jobs, 120)
+    opened(browser, server, "check", LINE)
+    wait_for(browser, "return document.querySelector('.tabled table') !== null")
     assert "the image is mirrored left to right" in text(browser, ".tabled table")
     click(browser, "Correct the mistakes")
     found, good = written(folder / "bad.corrected.nc", 120), Measurement.read(folder / "good.nc")
@@ -115,3 +160,101 @@ def test_what_is_typed_for_a_run_survives_a_reload(browser, server):
     opened(browser, server, "displacement", LINE)
     wait_for(browser, "return document.querySelector('.command code')?.textContent.includes('--threshold 4.5')")
     assert errors(browser) == []
+
+
+# -- keys of the mask editor -------------------------------------------------------------------------------------
+
+WIDTH = "Number(document.querySelector('input[aria-label=\"Width of the brush (px)\"]').value)"
+STROKES = "document.querySelectorAll('.over .brush').length"
+EFFECT = "document.querySelector('[aria-label=\"Effect of the shape\"] [aria-pressed=true]').textContent"
+
+
+def keys(driver: Any, *presses: str) -> None:
+    """Press keys where the focus is; Ctrl+ and Shift+ before a key hold these."""
+    from selenium.webdriver.common.action_chains import ActionChains
+    from selenium.webdriver.common.keys import Keys
+
+    for press in presses:
+        *holds, key = press.split("+") if len(press) > 1 else [press]
+        chain = ActionChains(driver)
+        modifiers = [{"Ctrl": Keys.CONTROL, "Shift": Keys.SHIFT}[hold] for hold in holds]
+        for modifier in modifiers:
+            chain.key_down(modifier)
+        chain.send_keys(key)
+        for modifier in modifiers:
+            chain.key_up(modifier)
+        chain.perform()
+
+
+def test_keys_of_the_brush_act_in_the_editor_alone(browser, server):
+    opened(browser, server, "displacement", LINE)
+    wait_for(browser, "return document.querySelector('.cropper img') !== null")
+    click(browser, "Brush")
+    drag(browser, ".cropper", 30, 20)
+    wait_for(browser, f"return {STROKES} === 1")
+    assert browser.execute_script("return document.activeElement.className").startswith("cropper")
+    keys(browser, "]", "]")
+    wait_for(browser, f"return {WIDTH} === 12")
+    keys(browser, *"[[[[")
+    wait_for(browser, f"return {WIDTH} === 5")
+    assert browser.execute_script(f"return {EFFECT}") == "Flow is here"
+    keys(browser, "e")
+    wait_for(browser, f"return {EFFECT} === 'No flow here'")
+    drag(browser, ".cropper", -30, 20)
+    wait_for(browser, "return document.querySelectorAll('.over .none.brush').length === 1")
+    keys(browser, "Ctrl+z")
+    wait_for(browser, f"return {STROKES} === 1")
+    keys(browser, "Ctrl+Shift+z")
+    wait_for(browser, f"return {STROKES} === 2")
+    keys(browser, "Ctrl+z", "Ctrl+z")  # the focus stays
+    wait_for(browser, f"return {STROKES} === 0")
+    click(browser, "Polygon")
+    drag(browser, ".cropper", 10, 10)
+    drag(browser, ".cropper", 20, 10)
+    wait_for(browser, "return document.querySelectorAll('.over .draft circle').length === 2")
+    keys(browser, "Ctrl+z")
+    wait_for(browser, "return document.querySelectorAll('.over .draft circle').length === 1")
+    column = browser.find_element("css selector", "input[aria-label='Column of the next corner (px)']")
+    column.click()
+    keys(browser, "e", "[", "Ctrl+z")  # keys of the field
+    browser.execute_script("document.activeElement.blur()")
+    keys(browser, "e", "]")  # outside of the editor
+    browser.execute_async_script("setTimeout(arguments[0], 500)")
+    assert browser.execute_script(f"return [{EFFECT}, {WIDTH}]") == ["No flow here", 5]
+    assert browser.execute_script("return document.querySelectorAll('.over .draft circle').length") == 1
+    assert errors(browser) == []
+
+
+def test_an_undo_by_key_in_another_view_shows_that_view_and_keeps_the_keys(browser, server, folder):
+    opened(browser, server, "displacement", LINE)
+    wait_for(browser, "return document.querySelector('.cropper img') !== null")
+    click(browser, "Brush")
+    drag(browser, ".cropper", 30, 20)
+    wait_for(browser, f"return {STROKES} === 1")
+    browser.execute_script(
+        "document.querySelector('[aria-label=\"View to draw in\"]').scrollIntoView({block: 'center'})"
+    )
+    pick(browser, "View to draw in", "60deg")
+    wait_for(browser, "return document.querySelector('.cropper img').alt.endsWith('60deg')")
+    drag(browser, ".cropper", 30, 20)  # the tool stays
+    wait_for(browser, f"return {STROKES} === 1")
+    keys(browser, "Ctrl+z")
+    wait_for(browser, f"return {STROKES} === 0")
+    keys(browser, "Ctrl+z")
+    wait_for(browser, "return document.querySelector('.cropper img').alt.endsWith('0deg') && "
+                      "!document.querySelector('.cropper img').alt.endsWith('60deg')")  # fmt: skip
+    wait_for(browser, "return document.activeElement.className.startsWith('cropper')")
+    keys(browser, "Ctrl+Shift+z")
+    wait_for(browser, f"return {STROKES} === 1")
+    keys(browser, "Ctrl+z")
+    wait_for(browser, f"return {STROKES} === 0")
+    assert errors(browser) == []
+
+
+@pytest.mark.parametrize(("width", "larger", "expected"), [
+    (8, True, 10), (1, True, 2), (100, True, 100), (8, False, 6), (2, False, 1), (1, False, 1), (None, True, 2),
+])  # fmt: skip
+def test_the_brush_grows_by_a_quarter_within_the_image(width, larger, expected):
+    brush = Brush(width=width)
+    brush.resize(larger, 100)
+    assert brush.width == expected

@@ -128,3 +128,17 @@ def test_a_run_is_started_watched_and_stopped(browser, server, folder):
     wait_for(browser, "return document.querySelector('.status').textContent.includes('Stopped')", 120)
     assert (out / "volume.nc").is_file()
     assert errors(browser) == []
+
+
+def test_the_runs_are_closed_where_they_cover_the_page(browser, server):
+    """On a phone the drawer is as wide as the window: it has a button of its own."""
+    visit(browser, server, "design")
+    button = "document.querySelector('button[aria-label=Runs]')"
+    browser.find_element("css selector", "button[aria-label=Runs]").click()
+    wait_for(browser, f"return {button}.ariaExpanded === 'true'")
+    wait_for(
+        browser, "return document.querySelector('.runs').checkVisibility() && document.getAnimations().length === 0"
+    )
+    browser.find_element("css selector", "button[aria-label='Close the runs']").click()
+    wait_for(browser, f"return {button}.ariaExpanded === 'false'")
+    assert errors(browser) == []

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import torch
 
-from app.serving import Served, opened
+from app.serving import Served, opened, served
 from app.test_pages import line
 from nerif.app.jobs import Jobs
 from nerif.app.project import Project
@@ -241,3 +241,33 @@ def test_reports_and_surfaces_come_from_the_folder_alone(server):
     for request in ("/report?of=../x", "/report?of=results", "/report?of=%00", "/surface?of=/etc&quantity=n"):
         assert server.get(request, cookie)[0] == 404
     assert server.get("/surface?of=film.zarr&quantity=index_excess&level=x", cookie)[0] == 404
+
+
+@needs_browser
+def test_the_app_on_a_result_opens_its_result_by_name(browser, tmp_path):
+    result(tmp_path / "flame <3", 8, 0.0)
+    with served(tmp_path / "flame <3") as server:
+        cookie = {"Cookie": server.cookie()}
+        status, headers, _ = server.get("/", cookie)
+        assert (status, headers["location"]) == (307, "/results")
+        browser.get(server.link)
+        wait_for(browser, "return location.pathname === '/results' && window.socket?.connected")
+        wait_for(browser, "return document.querySelectorAll('.cuts img[src]').length === 3")
+        assert text(browser, ".tabled tr.chosen th") == "flame <3"
+        headings = browser.execute_script("return [...document.querySelectorAll('main h2')].map(e => e.textContent)")
+        assert "flame <3" in headings
+        assert "." not in headings
+        tab(browser, "In 3-D")
+        wait_for(browser, "return document.querySelector('.legend li')?.textContent === 'flame <3'")
+        tab(browser, "Report")
+        wait_for(browser, "return document.querySelector('iframe.report')?.title === 'Report of flame <3'")
+        tab(browser, "Export")
+        wait_for(browser, "return document.querySelector('input[aria-label=\"File to write\"]')?.offsetParent")
+        panel = "[...document.querySelectorAll('.command code')].map(code => code.textContent)"
+        assert "nerif export . -o 'exports/flame <3.vti'" in browser.execute_script(f"return {panel}")
+        assert errors(browser) == []
+
+
+def test_other_folders_open_on_the_first_page(server):
+    status, headers, _ = server.get("/", {"Cookie": server.cookie()})
+    assert (status, headers["location"]) == (307, "/design")

@@ -192,4 +192,4 @@ def results(driver: Any, folder: Path) -> None:
     name.send_keys("\ue009" + "a" + "\ue000", "exports/field.nc")
     wait_for(driver, "return document.querySelector('.command code').textContent.includes('exports/field.nc')")
     click(driver, "Export")
-    runs_done(driver, 4)
+    runs_done(driver, 5)

@@ -51,6 +51,7 @@ def test_wrong_arguments(words, error, tmp_path, monkeypatch):
         "pattern --kind chessboard -o x.pdf --columns 7",
         "export m.nc -o taken.vti --force",
         "export absent --help",
+        "app absent --demo",
         "design",
     ],
 )

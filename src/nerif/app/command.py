@@ -24,8 +24,12 @@ class App(Settings):
     Each step shows its command line; runs continue when page and server are closed.
     """
 
-    folder: Annotated[Path, tyro.conf.Positional] = Path(".")
-    """Folder of the project; files outside it are neither read nor written."""
+    folder: Annotated[Path | None, tyro.conf.Positional] = None
+    """Folder of the project, by default the current one; files outside it are neither read nor written. A result
+    directory opens on the page Results."""
+    demo: bool = False
+    """Render a small experiment into a new folder (by default nerif-demo), with a guide that leads through all
+    pages."""
     port: int = 8620
     """Port to listen on; if it is in use, the next free one."""
     host: str = "127.0.0.1"
@@ -52,7 +56,14 @@ def run(settings: App) -> None:
         raise InputError(f"expected NiceGUI, which is not installed; {install('app')}", field="app")
     from nerif.app.server import Address, serve
 
-    serve(settings.folder, Address.of(settings.host, settings.port, settings.token), settings.browser)
+    address = Address.of(settings.host, settings.port, settings.token)
+    folder = settings.folder or Path(".")
+    if settings.demo:
+        from nerif.app.demo import FOLDER, fill
+
+        folder = settings.folder or FOLDER
+        fill(folder)
+    serve(folder, address, settings.browser)
 
 
 def main(arguments: list[str]) -> None:

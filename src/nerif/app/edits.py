@@ -80,11 +80,19 @@ class UndoButtons:
 
     def __init__(self, edits: Edits[Any], on_step: Callable[[str], Awaitable[None] | None]) -> None:
         self._edits, self._on_step = edits, on_step
-        self._undo = ui.button("Undo", icon="undo", on_click=lambda: self._report(edits.undo()))
-        self._redo = ui.button("Redo", icon="redo", on_click=lambda: self._report(edits.redo()))
+        self._undo = ui.button("Undo", icon="undo", on_click=lambda: self.undo())
+        self._redo = ui.button("Redo", icon="redo", on_click=lambda: self.redo())
         for button in (self._undo, self._redo):
             button.props("outline no-caps dense")
         self.show()
+
+    def undo(self) -> Awaitable[None] | None:
+        """Undo the last step, as by the button."""
+        return self._report(self._edits.undo())
+
+    def redo(self) -> Awaitable[None] | None:
+        """Repeat the last step that was undone, as by the button."""
+        return self._report(self._edits.redo())
 
     def _report(self, view: str) -> Awaitable[None] | None:
         return self._on_step(view) if view else None

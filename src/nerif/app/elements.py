@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from html import escape
@@ -146,7 +147,10 @@ class CommandLine:
     def show(self, arguments: Sequence[str]) -> None:
         """Show the command line of these arguments."""
         self.line = command_line(arguments)
-        self._text.set_content(f"<code tabindex=0>{escape(self.line)}</code>")
+        words = (
+            f"<span>{escape(shlex.quote(word))}</span>" for word in ("nerif", *arguments)
+        )  # lines break between them
+        self._text.set_content(f"<code tabindex=0>{' '.join(words)}</code>")
 
 
 # browsers offer navigator.clipboard over TLS or on localhost only; elsewhere execCommand copies

@@ -13,6 +13,7 @@ from pathlib import Path
 from nicegui import ui
 
 from nerif.app.elements import dialog, refusals, text_html
+from nerif.app.guide import guide
 from nerif.app.jobs import REFUSED, Job
 from nerif.app.result_volumes import film_progress
 from nerif.app.workspace import READ_ONLY, Workspace
@@ -75,12 +76,13 @@ def frame(work: Workspace, page: Page, pages: Sequence[Page]) -> Iterator[None]:
         menu = ui.button(icon="menu").props('flat round aria-label="Pages"')
         ui.html(
             f"<span class=brand>nerif</span><span class=project title='{escape(str(work.project.folder))}'>"
-            f"{escape(str(work.project.folder))}</span>", sanitize=False,
+            f"<span class=parent>{escape(str(work.project.folder).removesuffix(work.project.name))}</span>"
+            f"{escape(work.project.name)}</span>", sanitize=False,
         ).classes("where")  # fmt: skip
         ui.space()
         drawer = JobsDrawer(work)
         _switch(dark)
-    with ui.left_drawer(value=True, bordered=True).props("width=208 breakpoint=900").classes("side") as left:
+    with ui.left_drawer(value=None, bordered=True).props("width=208 breakpoint=900").classes("side") as left:
         menu.on_click(left.toggle)
         links = "".join(
             f"<li><a href='{p.path}'{' aria-current=page' if p is page else ''}>"
@@ -93,6 +95,7 @@ def frame(work: Workspace, page: Page, pages: Sequence[Page]) -> Iterator[None]:
         ui.html(f"<h1>{escape(page.title)}</h1><p class=lead>{escape(page.about)}</p>", sanitize=False)
         if not work.project.writable:
             ui.html(f"<ul class=notes><li role=status>{READ_ONLY}</li></ul>", sanitize=False)
+        guide(work, page, pages)
         yield
 
 
@@ -121,16 +124,22 @@ class JobsDrawer:
     def build(self) -> None:
         """Build the drawer beside the page."""
         with ui.right_drawer(value=False, bordered=True).props("width=380 overlay").classes("runs") as self.drawer:
-            ui.html("<h2>Runs</h2>", sanitize=False)
+            with ui.element("div").classes("drawer-head"):
+                ui.html("<h2>Runs</h2>", sanitize=False)
+                ui.button(icon="close", on_click=self.drawer.hide).props('flat round dense aria-label="Close the runs"')
             self._at_once = ui.number(
                 "At the same time", value=self.work.jobs.at_once, min=1, max=64, on_change=self._set
             ).props("dense outlined")
             self.place = ui.element("div").props('role="list" aria-label="Runs"')
+        self.drawer.on_value_change(self._on_toggle)
         ui.timer(EVERY, self._refresh)
 
     def toggle(self) -> None:
         """Open or close the drawer."""
         self.drawer.toggle()
+
+    def _on_toggle(self) -> None:
+        """Report the state to screen readers, also after a tap beside the drawer."""
         self.button.props(f"aria-expanded={'true' if self.drawer.value else 'false'}")
 
     def _set(self) -> None:

@@ -37,6 +37,7 @@ class JobForm:
     subject : subject of the run, part of the key that restores its status after a reload
     on_continue : called by a button that continues with the output; None for no button
     lines : number of log lines shown after success
+    on_end : called when the run has ended
     """
 
     def __init__(
@@ -44,12 +45,13 @@ class JobForm:
         main: Sequence[str] = (), out: Callable[[], str] | None = None,
         before: Callable[[], Awaitable[None]] | None = None, subject: str = "",
         on_continue: Callable[[str], Awaitable[None]] | None = None, lines: int = LINES,
+        on_end: Callable[[Job], Awaitable[None]] | None = None,
     ) -> None:  # fmt: skip
         self.work, self.name, self.words, self.out, self.before = work, name, words, out, before
         self.view = FormView(form, self._on_change, work.draft(name), main)
         self.command = CommandLine()
         self.button = ui.button(button, icon="playlist_add", on_click=self._start).props("unelevated no-caps")
-        self.status = JobStatus(work, f"{name}.run {subject}".strip(), on_continue=on_continue, lines=lines)
+        self.status = JobStatus(work, f"{name}.run {subject}".strip(), on_end, on_continue, lines)
         self.show()
 
     @property
@@ -75,7 +77,9 @@ class JobForm:
             if self.out is not None:
                 self.work.project.path(self.out()).parent.mkdir(parents=True, exist_ok=True)
             words = self.arguments
-            self.status.follow(self.work.jobs.add(words, f"{words[0].capitalize()} {words[1]}"))
+            self.status.follow(
+                self.work.jobs.add(words, f"{words[0].capitalize()} {self.work.project.title(words[1])}")
+            )
 
 
 class JobStatus:
@@ -97,9 +101,9 @@ class JobStatus:
         self.work, self.name, self.job = work, name, str(work.draft(name).get("job", ""))
         self._on_end, self._on_continue, self._lines = on_end, on_continue, {"done": lines, "failed": 30}
         self._content: tuple[str, ...] = ()
-        self.place = ui.element("div").props("role=status aria-live=polite")
-        self.further = ui.element("div")
         with ui.element("div"):
+            self.place = ui.element("div").props("role=status aria-live=polite")
+            self.further = ui.element("div")
             ui.timer(EVERY, self._look)
 
     def follow(self, job: Job) -> None:

@@ -81,8 +81,11 @@ class LiveView:
             state = "" if job is None or (job.request and job.state == "running") else job.state
             button.set_visibility(state in STATES[name])
         self.bar.set_visibility(job is not None)
+        self.choice.set_visibility(bool(jobs))
         if job is not None:
             await self._show(job)
+        elif not jobs:
+            self.status.set_content("No run has been started in this folder yet.")
 
     async def _show(self, job: Job) -> None:
         out = self.work.project.path(job.out)

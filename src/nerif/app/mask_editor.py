@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Awaitable, Callable, Mapping, Sequence
+from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -31,9 +32,46 @@ EFFECTS = {True: "Flow is here", False: "No flow here"}
 STROKE = """(event) => { const me = event.currentTarget, r = me.getBoundingClientRect(), points = [];
 if (event.button !== 0) return;
 const add = (e) => points.push([(e.clientX - r.left) / r.width, (e.clientY - r.top) / r.height]);
-event.preventDefault(); me.setPointerCapture(event.pointerId); add(event);
+event.preventDefault(); me.focus({preventScroll: true}); me.setPointerCapture(event.pointerId); add(event);
 const end = (e) => { me.removeEventListener('pointermove', add); emit(points.slice(0, 2000)); };
 me.addEventListener('pointermove', add); me.addEventListener('pointerup', end, {once: true}); }"""
+
+KEYS = """(event) => { if (event.target.matches('input, textarea, select')) return;
+const key = event.key.toLowerCase(), command = event.ctrlKey || event.metaKey;
+let act = {'[': 'smaller', ']': 'larger'}[key];
+if (!act && key === 'e' && !command && !event.altKey) act = 'effect';
+if (!act && command && key === 'z') act = event.shiftKey ? 'redo' : 'undo';
+if (!act && event.ctrlKey && key === 'y') act = 'redo';
+if (!act) return;
+event.preventDefault(); emit(act); }"""
+"""Keys of the editor, active while the focus is in it: single letters must not act elsewhere (WCAG 2.1.4)."""
+KEY_HELP = (
+    "Keys, after a click into the image: <kbd>[</kbd> and <kbd>]</kbd> width of the brush, <kbd>E</kbd> flow or no "
+    "flow, <kbd>Ctrl</kbd>+<kbd>Z</kbd> undo, <kbd>Ctrl</kbd>+<kbd>Shift</kbd>+<kbd>Z</kbd> redo."
+)
+GROWTH = 1.25  # of the brush, per key
+
+
+@dataclass
+class Brush:
+    """Tool, effect and width of strokes; they stay from view to view.
+
+    Parameters
+    ----------
+    tool : of TOOLS
+    inside : whether the flow is where it draws
+    width : of the brush, px
+    """
+
+    tool: str = "polygon"
+    inside: bool = True
+    width: float | None = 8
+
+    def resize(self, larger: bool, limit: int) -> None:
+        """Change the width by a quarter, at least by one pixel, between 1 and `limit`."""
+        now = self.width or 1
+        width = max(now + 1, round(now * GROWTH)) if larger else min(now - 1, round(now / GROWTH))
+        self.width = min(max(width, 1), limit)
 
 
 class MaskCard:
@@ -61,6 +99,7 @@ class MaskCard:
             self.undo = UndoButtons(self.edits, self._step)
             button = ui.button("Show the threshold's mask", icon="contrast", on_click=self._threshold)
             button.props("flat no-caps dense")
+        self.brush = Brush()
         self.place = ui.element("div").classes("stack")
         self.status = ui.html("", sanitize=False).classes("status").props('aria-live="polite"')
         record = Mask(Path(name), Path("masked.nc"))
@@ -94,13 +133,25 @@ class MaskCard:
             index = self.measurement.names.index(str(self.view.value))
             shape = self.measurement.cameras[index].image_size
             address = magnitude_address(self.measurement, index)
-            MaskEditor(str(self.view.value), shape, address, self.edits, self._store)
+            self.editor = MaskEditor(
+                str(self.view.value), shape, address, self.edits, self.brush, self._store, self._step_by_key
+            )  # fmt: skip
         self._show_views()
 
     def _step(self, view: str) -> None:
-        self.view.set_value(view)
-        self._build_editor()
+        if view == self.view.value:
+            self.editor.show()  # a new editor would lose the focus, and the next key
+        else:
+            self.view.set_value(view)
         self._store()
+
+    def _step_by_key(self, back: bool) -> None:
+        """Undo or redo; the keys stay with the editor, which is a new one after a step in another view."""
+        if back:
+            self.undo.undo()
+        else:
+            self.undo.redo()
+        self.editor.focus()
 
     def _store(self) -> None:
         """Store the shapes in the draft and as the images that `nerif mask` reads."""
@@ -156,31 +207,47 @@ class MaskEditor:
     shape : height and width, px
     address : address of its image
     edits : shapes of all views, changes in place
+    brush : the tool, changed in place
     on_change : called after each step
+    on_step : called with whether to undo, else to redo
     """
 
     def __init__(
-        self, name: str, shape: tuple[int, int], address: str, edits: Edits[Shapes], on_change: Callable[[], None]
-    ) -> None:
-        self.name, self.shape, self.edits, self._on_change = name, shape, edits, on_change
+        self, name: str, shape: tuple[int, int], address: str, edits: Edits[Shapes], brush: Brush,
+        on_change: Callable[[], None], on_step: Callable[[bool], None],
+    ) -> None:  # fmt: skip
+        self.name, self.shape, self.edits, self.brush = name, shape, edits, brush
+        self._on_change, self._on_step = on_change, on_step
         self.corners: list[tuple[float, float]] = []
         height, width = shape
-        with ui.element("div").classes("numbers"):
-            self._tool = ui.toggle(TOOLS, value="polygon").props('no-caps aria-label="Tool"')
-            self._inside = ui.toggle(EFFECTS, value=True).props('no-caps aria-label="Effect of the shape"')
-            self._width = ui.number("Width of the brush", value=8, min=1, step=1, suffix="px").props("outlined dense")
-            self._width.props["aria-label"] = "Width of the brush (px)"
-        with ui.element("div").classes("cropper").on("pointerdown", self._stroke, js_handler=STROKE) as place:
-            place.style(f"aspect-ratio: {width / height:.4f}; --aspect: {width / height:.4f}")
-            image = ui.element("img").props("draggable=false")
-            image.props["src"], image.props["alt"] = address, f"Magnitude of the signal in view {name}"
-            self._over = ui.html("", sanitize=False).classes("over")
-        with ui.element("div").classes("numbers"):
-            self._x, self._y = self._number("Column", width), self._number("Row", height)
-            self._button("Add a corner", "add", self._add_corner)
-            self._button("Close the polygon", "pentagon", self._close)
-            self._button("Clear the view", "layers_clear", lambda: self._put(()))
+        with ui.element("div").classes("stack").on("keydown", self._key, js_handler=KEYS):
+            with ui.element("div").classes("numbers"):
+                tool = ui.toggle(TOOLS, value=brush.tool).props('no-caps aria-label="Tool"')
+                tool.on_value_change(lambda event: setattr(brush, "tool", event.value))
+                self._effect = ui.toggle(EFFECTS, value=brush.inside).props('no-caps aria-label="Effect of the shape"')
+                self._effect.on_value_change(lambda event: setattr(brush, "inside", event.value))
+                self._size = ui.number("Width of the brush", value=brush.width, min=1, step=1, suffix="px")
+                self._size.props("outlined dense").props["aria-label"] = "Width of the brush (px)"
+                self._size.on_value_change(lambda event: setattr(brush, "width", event.value))
+            with ui.element("div").classes("cropper").on("pointerdown", self._stroke, js_handler=STROKE) as self._place:
+                self._place.style(f"aspect-ratio: {width / height:.4f}; --aspect: {width / height:.4f}")
+                self._place.props('tabindex=0 role=group aria-keyshortcuts="[ ] E Control+Z Control+Shift+Z"')
+                self._place.props["aria-label"] = f"Drawing in view {name}"
+                image = ui.element("img").props("draggable=false")
+                image.props["src"], image.props["alt"] = address, f"Magnitude of the signal in view {name}"
+                self._over = ui.html("", sanitize=False).classes("over")
+            ui.html(f"<p>{KEY_HELP}</p>", sanitize=False).classes("help")
+            with ui.element("div").classes("numbers"):
+                self._x, self._y = self._number("Column", width), self._number("Row", height)
+                self._button("Add a corner", "add", self._add_corner)
+                self._button("Close the polygon", "pentagon", self._close)
+                self._button("Clear the view", "layers_clear", lambda: self._put(()))
         self.show()
+
+    def focus(self) -> None:
+        """Move the focus into the image."""
+        move = f"getHtmlElement({self._place.id})?.focus({{preventScroll: true}})"
+        ui.run_javascript(f"setTimeout(() => {move}, 50)")  # a new editor is on the page only then
 
     def _number(self, label: str, size: int) -> ui.number:
         control = ui.number(label, value=0, min=0, max=size - 1, step=1, suffix="px").props("outlined dense")
@@ -195,13 +262,26 @@ class MaskEditor:
         points = [(x * width - 0.5, y * height - 0.5) for x, y in event.args]
         if not points:
             return
-        if self._tool.value == "brush":
+        if self.brush.tool == "brush":
             with refusals():
-                brush = MaskShape("brush", tuple(points), bool(self._inside.value), float(self._width.value or 0))
+                brush = MaskShape("brush", tuple(points), bool(self.brush.inside), float(self.brush.width or 0))
                 self._put((*self.edits.now[self.name], brush))
             return
         self.corners.append(points[-1])
         self.show()
+
+    def _key(self, event: Any) -> None:
+        """Do what a key of KEYS stands for."""
+        if event.args in ("smaller", "larger"):
+            self.brush.resize(event.args == "larger", max(self.shape))
+            self._size.set_value(self.brush.width)
+        elif event.args == "effect":
+            self._effect.set_value(not self.brush.inside)
+        elif event.args == "undo" and self.corners:  # of the polygon that is not closed yet
+            self.corners.pop()
+            self.show()
+        else:
+            self._on_step(event.args == "undo")
 
     def _add_corner(self) -> None:
         self.corners.append((float(self._x.value or 0), float(self._y.value or 0)))
@@ -209,7 +289,7 @@ class MaskEditor:
 
     def _close(self) -> None:
         with refusals():
-            polygon = MaskShape("polygon", tuple(self.corners), bool(self._inside.value))
+            polygon = MaskShape("polygon", tuple(self.corners), bool(self.brush.inside))
             self._put((*self.edits.now[self.name], polygon))
 
     def _put(self, shapes: Shapes) -> None:

@@ -63,6 +63,15 @@ class Project:
         return self.folder.name or str(self.folder)
 
     @property
+    def is_result(self) -> bool:
+        """Whether the folder itself is a result directory."""
+        return _is_result(self.folder)
+
+    def title(self, name: str) -> str:
+        """Return the name of a file or folder for display: that of the project's folder instead of a dot."""
+        return self.name if name == "." else name
+
+    @property
     def writable(self) -> bool:
         """Whether files may be written into the folder."""
         return os.access(self.folder, os.W_OK)

@@ -33,6 +33,7 @@ class Row:
     Parameters
     ----------
     name : relative to the project
+    title : name for display
     cells : cells of the table after the name
     word : verdict in short
     sentence : verdict in full, or the missing data
@@ -41,6 +42,7 @@ class Row:
     """
 
     name: str
+    title: str
     cells: tuple[str, ...]
     word: str
     sentence: str
@@ -58,10 +60,10 @@ def _row_of_result(project: Project, name: str) -> Row:
     """The row of a result, cached until the newest of its files changes."""
     out = ResultDirectory(project.path(name))
     last = max(filter(out.has, (METRICS, FIELD, RUN, LIVE, VOLUME)), key=lambda n: (out / n).stat().st_mtime_ns)
-    return project.from_cache(f"{name}/{last}", "row", lambda _: _of(name, out.read(views=False)))
+    return project.from_cache(f"{name}/{last}", "row", lambda _: _of(name, project.title(name), out.read(views=False)))
 
 
-def _of(name: str, result: Result) -> Row:
+def _of(name: str, title: str, result: Result) -> Row:
     judgement, metrics = verdict(result), result.metrics
     views = [v for v in metrics.views if math.isfinite(v["rms"])]
     worst = rms_with_unit(max(views, key=lambda v: v["rms"]), 3) if views else ""
@@ -73,7 +75,7 @@ def _of(name: str, result: Result) -> Row:
         word, sentence = "", " ".join(gap.sentence for gap in result.missing) or "No data yet."
     time = "" if seconds is None else f"{float(seconds):.0f} s"
     cells = (result.method, word, error, worst, outcome, time, str(result.about.get("finished", "")))
-    return Row(name, cells, word, sentence, tuple(accuracy_rows(result)) if ended else ())
+    return Row(name, title, cells, word, sentence, tuple(accuracy_rows(result)) if ended else ())
 
 
 def _row_of_film(project: Project, name: str) -> Row | None:
@@ -88,7 +90,7 @@ def _row_of_film(project: Project, name: str) -> Row | None:
     grid = " × ".join(str(n) for n in store.grid.shape[::-1])
     figures = (("Frames", f"{done} of {count}"), ("Time", span), ("Voxels", f"{grid} (x, y, z)"))
     cells = (f"film, {count} frames", "", "", "", outcome, span, "")
-    return Row(name, cells, "", f"{done} of {count} frames are complete.", figures, film=True)
+    return Row(name, project.title(name), cells, "", f"{done} of {count} frames are complete.", figures, film=True)
 
 
 def result_table(rows: Sequence[Row], selection: str, choose: Callable[[str], Awaitable[None]]) -> None:
@@ -106,8 +108,8 @@ def result_table(rows: Sequence[Row], selection: str, choose: Callable[[str], Aw
 def _line(row: Row, active: bool, choose: Callable[[str], Awaitable[None]]) -> None:
     with ui.element("tr").classes("chosen" if active else ""):
         with ui.element("th").props("scope=row"):
-            button = ui.button(row.name, on_click=lambda: choose(row.name)).props("flat dense no-caps align=left")
-            button.props["aria-label"] = f"Show {row.name}"
+            button = ui.button(row.title, on_click=lambda: choose(row.name)).props("flat dense no-caps align=left")
+            button.props["aria-label"] = f"Show {row.title}"
             button.props["aria-pressed"] = "true" if active else "false"
         for title, cell in zip(HEAD[1:], row.cells, strict=True):
             verdict_class = f"verdict {CLASSES.get(row.word, '')}" if title == "Verdict" and cell else ""

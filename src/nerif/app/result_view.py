@@ -62,13 +62,13 @@ class ResultView:
             text_html(f"{error}.", classes="note")
             return
         if not quantities:
-            text_html(f"{self.name}: it contains no field.", classes="note")
+            text_html(f"{self.work.project.title(self.name)}: it contains no field.", classes="note")
             return
         self.readable = True
         options = {q: describe(q)[1].capitalize() for q in quantities}
         with ui.element("div").classes("choices"):
             self.quantity = select("Quantity", options, self.draft.get("quantity"))
-            choices = {"": "Nothing", **{name: name for name in self.others}}
+            choices = {"": "Nothing", **{name: self.work.project.title(name) for name in self.others}}
             self.against = select("Compare with", choices, self.draft.get("against"))
             self.spread = ui.switch("Standard deviation", value=bool(self.draft.get("spread")))
         for control in (self.quantity, self.against, self.spread):
@@ -155,10 +155,11 @@ class ResultView:
         grid = common_grid(first, second)
         change = difference(first, second, grid)
         ends = map_range(change.values.numpy(), True, 0.998)
+        title, other_title = map(self.work.project.title, (self.name, against))
         panels = [
-            Panel(self.name, resampled(first, grid), limits, unit, colours),
-            Panel(against, resampled(second, grid), limits, unit, colours),
-            Panel(f"{against} minus {self.name}", change, ends, unit, DIVERGING),
+            Panel(title, resampled(first, grid), limits, unit, colours),
+            Panel(other_title, resampled(second, grid), limits, unit, colours),
+            Panel(f"{other_title} minus {title}", change, ends, unit, DIVERGING),
         ]
         if first.grid == second.grid:
             return panels, ""
@@ -205,7 +206,7 @@ class ResultView:
     def _surface_of(self, name: str, frame: int) -> Surface:
         path = self.work.project.path(name)
         file = path / ("zarr.json" if ending(path) == ".zarr" else VOLUME)
-        return Surface(name, frame, file.stat().st_mtime_ns if file.is_file() else 0)
+        return Surface(name, self.work.project.title(name), frame, file.stat().st_mtime_ns if file.is_file() else 0)
 
 
 def _interval(times: Sequence[float]) -> float:

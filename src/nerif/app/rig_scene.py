@@ -11,7 +11,7 @@ import numpy as np
 from nicegui import ui
 
 from nerif.app.elements import table_html, text_html
-from nerif.app.surfaces import scene_of
+from nerif.app.surfaces import GROUND, scene_of
 from nerif.common.conventions import InputError
 from nerif.geometry import Box, Camera
 from nerif.imaging.calibration.importers.importers import import_box, import_cameras
@@ -87,7 +87,7 @@ def show_rig(rig: Rig) -> None:
             if one.background is not None:
                 outline(corners.end, colour)
             at = (corners.start.mean(axis=0) - 0.04 * reach * corners.direction.mean(axis=0) - centre) * scale
-            style = f"color: #16202b; font: 600 13px system-ui; border-bottom: 3px solid {colour}"
+            style = f"color: #16202b; background: {GROUND}; font: 600 13px system-ui; border-bottom: 3px solid {colour}"
             scene.text(one.name, style=style).move(*at.tolist())
         if rig.box is not None:
             ends = np.array(list(itertools.product(*zip(rig.box.lower, rig.box.upper, strict=True))))

@@ -93,7 +93,7 @@ def serve(folder: Path, address: Address, browser: bool = True) -> None:
         say(f"note: {READ_ONLY}")
     logging.getLogger("uvicorn.error").addFilter(is_relevant)
     app.add_middleware(Guard, token=address.token, hosts=address.names, port=address.port)
-    app.add_api_route("/", lambda: RedirectResponse(PAGES[0].path), include_in_schema=False)
+    app.add_api_route("/", lambda: RedirectResponse(_first(work.project).path), include_in_schema=False)
     for path, handler in routes(work).items():
         app.add_api_route(path, handler, include_in_schema=False)
     for page in PAGES:
@@ -136,6 +136,11 @@ def is_relevant(record: logging.LogRecord) -> bool:
     """
     error = record.exc_info[1] if record.exc_info else None
     return not (isinstance(error, RuntimeError) and str(error) == "No response returned.")
+
+
+def _first(project: Project) -> Page:
+    """The page that opens first: Results for a result directory."""
+    return next(page for page in PAGES if page.name == "results") if project.is_result else PAGES[0]
 
 
 def _handler(work: Workspace, page: Page) -> Callable[[], Awaitable[None]]:

@@ -94,11 +94,13 @@ class Surface:
     Parameters
     ----------
     name : result or film, relative to the project
+    title : its name for display
     frame : frame of a film
     stamp : value that changes with the file
     """
 
     name: str
+    title: str
     frame: int
     stamp: int
 
@@ -150,7 +152,7 @@ class SurfaceView:
             address = surface_address(surface.name, self.quantity, self.level, surface.frame, surface.stamp)
             self.scene.add(address, colour, opacity)
         names = "".join(
-            f"<li><i style='background:{colour};opacity:{opacity}'></i>{escape(surface.name)}</li>"
+            f"<li><i style='background:{colour};opacity:{opacity}'></i>{escape(surface.title)}</li>"
             for surface, (colour, opacity) in zip(self.surfaces, COLOURS, strict=False)
         )
         self._legend.set_content(f"<ul class=legend>{names}</ul>")

@@ -38,6 +38,8 @@ INPUTS = {
     "info": "no such file or folder; expected a measurement, volume or result",
 }
 """Commands whose first word is a file or folder to read, with the error where it does not exist."""
+MAKES_INPUT = {"app": "--demo"}
+"""Commands with an option that makes the file or folder of their first word."""
 OUTPUTS = ("design", "pattern", "mask", "check", "simulate", "project", "movie", "export")
 """Commands that write a file (--out), and overwrite none without --force."""
 OPTIONS = Path(__file__).with_name("options.json")
@@ -56,7 +58,8 @@ def check_arguments(command: str, arguments: list[str]) -> None:
     words = words_of(arguments)
     if {"-h", "--help"} & {*words}:
         return
-    if command in INPUTS and first and not first.startswith("-") and not os.path.lexists(first):
+    is_read = command in INPUTS and MAKES_INPUT.get(command) not in words
+    if is_read and first and not first.startswith("-") and not os.path.lexists(first):
         raise InputError(INPUTS[command], field=first)
     _check_options(command, words)
     out = flag_value(words, "-o", "--out")

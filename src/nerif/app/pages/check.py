@@ -7,32 +7,30 @@ from dataclasses import replace
 
 from nicegui import ui
 
-from nerif.analysis.consistency import Consistency, check_consistency
-from nerif.app.elements import (
-    CommandLine,
-    FileChoice,
-    card,
-    items_html,
-    refusals,
-    table_html,
-    text_html,
-    work_in_progress,
-)
-from nerif.app.form_view import FormView
+from nerif.analysis.consistency_file import CheckFindings, read_findings
+from nerif.app.elements import CommandLine, FileChoice, card, items_html, refusals, table_html, text_html
 from nerif.app.forms import Form
 from nerif.app.frame import Page
 from nerif.app.job_form import JobForm, JobStatus
+from nerif.app.jobs import Job
+from nerif.app.project import OWN
 from nerif.app.workspace import Workspace
 from nerif.cli.commands.check import Check
-from nerif.data.measurement import Measurement
 
-__all__ = ["PAGE"]
+__all__ = ["PAGE", "findings_file"]
 
 AGREE = "Each is predicted by a quick reconstruction from the others."
 REFINE = "Cameras are refined together with a quick field."
 VIEW_SETTINGS = ("voxels", "aperture")
 RIG_LINES = 60  # of its output: a table of the views and the findings
 RIG_SETTINGS = ("pose_sigma_mm", "pose_sigma_deg", "time_limit", "aperture")
+NOT_COMPARED = "The views have not been compared yet."
+CHANGED = "The measurement has changed since this comparison; compare the views again."
+
+
+def findings_file(measurement: str) -> str:
+    """Return the file with the findings of a measurement, relative to the project."""
+    return f"{OWN}/checks/{measurement.removesuffix('.nc')}.json"
 
 
 class CheckPage:
@@ -46,15 +44,16 @@ class CheckPage:
 
     def __init__(self, work: Workspace, measurements: Sequence[str]) -> None:
         self.work = work
-        draft = work.draft(PAGE.name)
         with ui.element("div").classes("columns"):
             with ui.element("div").classes("stack"):
                 with card("Do the views agree?", AGREE), ui.element("div").classes("form"):
-                    name = draft.get("measurement")
+                    name = work.draft(PAGE.name).get("measurement")
                     self.choice = FileChoice("Measurement", measurements, name, work.measurements, self._on_choice)
-                    self.form = FormView(Form(self._record(), only=VIEW_SETTINGS), self._on_change, draft.get("values"))
-                    self.button = ui.button("Compare the views", icon="rule", on_click=self.compare)
-                    self.button.props("unelevated no-caps")
+                    self.views = JobForm(
+                        work, f"{PAGE.name}.views", Form(self._record(), only=VIEW_SETTINGS), self._view_words,
+                        "Compare the views", out=lambda: findings_file(self.choice.name), lines=0,
+                        on_end=self._on_end,
+                    )  # fmt: skip
                 with card("Is the rig as it was calibrated?", REFINE), ui.element("div").classes("form"):
                     record = replace(self._record(), refine=("cameras",))
                     self.rig = JobForm(
@@ -62,74 +61,57 @@ class CheckPage:
                         lines=RIG_LINES,
                     )  # fmt: skip
             with ui.element("div").classes("stack"):
-                with card("The same on the command line"):
-                    self.command = CommandLine()
                 with card("Findings"):
-                    self.notice = ui.element("div").classes("stack").props('aria-live="polite"')
-                    with self.notice:
-                        text_html("The views have not been compared yet.", classes="status")
+                    self.findings = ui.element("div").classes("stack").props('aria-live="polite"')
                 with card("Undone") as self.correction:
                     self.correction_status = JobStatus(work, f"{PAGE.name}.undone", on_continue=self.choice.choose)
         self.correction.set_visibility(bool(self.correction_status.job))
         self.show()
 
-    def _keep(self) -> None:
-        values = self.form.form.changed(self.form.values)
-        self.work.keep(PAGE.name, {"measurement": self.choice.name, "values": values})
-
     def _record(self) -> Check:
         return Check(self.work.project.path(self.choice.name))
+
+    def _view_words(self) -> list[str]:
+        return ["check", self.choice.name, "--findings", findings_file(self.choice.name)]
 
     def _refine_words(self) -> list[str]:
         return ["check", self.choice.name, "--refine", "cameras"]
 
-    def show(self) -> None:
-        """Show the command line as it is now."""
-        self.command.show(self.arguments)
-        self.button.set_enabled(self.form.valid)
-
-    def _on_change(self) -> None:
-        self._keep()
-        self.show()
-
-    @property
-    def arguments(self) -> list[str]:
-        """Arguments of nerif that compare the views."""
-        return ["check", self.choice.name, *self.form.arguments]
-
     def _on_choice(self) -> None:
-        self._keep()
+        self.work.keep(PAGE.name, {"measurement": self.choice.name})
         self.correction.set_visibility(bool(self.correction_status.job))
-        self.notice.clear()
-        self.show()
+        self.views.show()
         self.rig.show()
+        self.show()
 
-    async def compare(self) -> None:
-        """Compare the views and show the findings."""
-        name, arguments = self.choice.name, self.arguments
-        progress = [0.0]
+    async def _on_end(self, job: Job) -> None:
+        """Show what the run has written."""
+        if job.state == "done":
+            self.show()
 
-        def step(count: int, total: int) -> None:
-            progress[0] = count / max(total, 1)
-
-        def work(settings: Check) -> Consistency:
-            measurement = Measurement.read(self.work.project.path(name))
-            return check_consistency(measurement, settings.voxels, step, settings.aperture)
-
+    def show(self) -> None:
+        """Show the findings of the selected measurement, which outlive page and server."""
+        name, result = self.choice.name, None
         messages: list[str] = []
-        result = None
-        with work_in_progress(self.button, self.notice), refusals(messages.append):
-            with self.notice:
-                bar = ui.linear_progress(0, show_value=False).props('aria-label="Comparing the views"')
-                ui.timer(0.3, lambda: bar.set_value(progress[0]))
-            result = await self.work.in_thread(work, self.form.record())
-        with self.notice:
+        with refusals(messages.append):
+            result, note = self._read(name)
+            messages += [note] if note else []
+        self.findings.clear()
+        with self.findings:
             for text in messages:
                 text_html(text, classes="status")
             if result is not None:
-                self._show(name, arguments, result)
+                self._show(name, result)
 
-    def _show(self, name: str, words: Sequence[str], result: Consistency) -> None:
+    def _read(self, name: str) -> tuple[CheckFindings | None, str]:
+        """Return the findings of a measurement, None before its first comparison, and a note about them."""
+        path, measurement = map(self.work.project.path, (findings_file(name), name))
+        if not path.is_file():
+            return None, NOT_COMPARED
+        result = self.work.project.from_cache(findings_file(name), "findings", read_findings)
+        return result, CHANGED if path.stat().st_mtime_ns < measurement.stat().st_mtime_ns else ""
+
+    def _show(self, name: str, result: CheckFindings) -> None:
         """The verdicts, and the correction that is offered."""
         ui.html(views_table(result), sanitize=False)
         if result.findings:
@@ -138,9 +120,9 @@ class CheckPage:
             text_html("No problems found.", classes="status")
         if result.remarks:
             ui.html(f"<h3>Notes</h3>{items_html(result.remarks, '')}", sanitize=False)
-        if result.corrections:
+        if result.correctable:
             out = self.work.project.free_name(f"{name.removesuffix('.nc')}.corrected.nc")
-            arguments = [*words, "--out", out]
+            arguments = ["check", name, "--out", out, *self.views.view.arguments]
             text_html("The mistakes can be undone, in a new file:", "h3")
             line = CommandLine()
             line.show(arguments)
@@ -158,7 +140,7 @@ class CheckPage:
             ui.html(f"<p>{link}</p>", sanitize=False)
 
 
-def views_table(result: Consistency) -> str:
+def views_table(result: CheckFindings) -> str:
     """Return the agreement of every view as HTML; nothing where there are too few views."""
     if not result.views:
         return ""

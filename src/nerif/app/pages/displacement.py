@@ -140,7 +140,7 @@ class MeasurementCard:
             self.fold = ui.expansion("Maps of all views", icon="grid_view", on_value_change=self._maps).classes("wide")
             with self.fold:
                 self.maps = ui.element("div")
-        with card("Where the flow is", "A mask tightens the visual hull. Views without a drawing go by the threshold."):
+        with card("Where the flow is", "A mask tightens the visual hull. Views without a drawing use the threshold."):
             self.place = ui.element("div").classes("stack")
         ui.timer(0.05, self._masks, once=True)
 

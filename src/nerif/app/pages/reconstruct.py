@@ -174,5 +174,5 @@ def _has_measurements(work: Workspace, name: str) -> bool:
         return False
 
 
-ABOUT = "The field behind a measurement, watched while it is found."
+ABOUT = "The field that explains a measurement, shown while the run improves it."
 PAGE = Page("reconstruct", "Reconstruct", "/reconstruct", ABOUT, build)

@@ -74,7 +74,7 @@ class ResultsPage:
 
     def _verdict(self) -> None:
         row = self.row
-        with card(row.name):
+        with card(row.title):
             text_html(row.sentence)
             if row.figures:
                 ui.html(figures([(a, b, "") for a, b in row.figures]), sanitize=False)
@@ -121,7 +121,7 @@ class ResultsPage:
             link.props["rel"] = "noopener"
             frame = ui.element("iframe").classes("report").props('sandbox="allow-scripts allow-downloads" loading=lazy')
             frame.props["src"] = address
-            frame.props["title"] = f"Report of {name}"
+            frame.props["title"] = f"Report of {self.row.title}"
         else:
             text_html("There is no report yet.", classes="note")
         text_html("The same on the command line", "h3")
@@ -130,7 +130,7 @@ class ResultsPage:
 
         def write() -> None:
             with refusals():
-                status.follow(self.work.jobs.add(["report", name], f"Report {name}"))
+                status.follow(self.work.jobs.add(["report", name], f"Report {self.row.title}"))
 
         async def on_end(job: Job) -> None:
             if job.state == "done":
@@ -159,7 +159,7 @@ class ResultsPage:
         """Build the form of a command that writes a file, with a choice of its format that changes its name."""
 
         def name_with(ending: str) -> str:
-            return self.work.project.free_name(f"exports/{PurePosixPath(self.row.name).stem}{ending}")
+            return self.work.project.free_name(f"exports/{PurePosixPath(self.row.title).stem}{ending}")
 
         first = next(iter(formats))
         with ui.element("div").classes("form"):
@@ -182,7 +182,7 @@ class ResultsPage:
         record = Figures(tyro.MISSING)
         form = Form(record, without=("config", "result", "out"))
         with ui.element("div").classes("form"):
-            text_html(f"They are written to {self.row.name}/figures.", classes="note")
+            text_html(f"They are written to {self.row.title}/figures.", classes="note")
             JobForm(
                 self.work, f"{PAGE.name}.figures", form, lambda: ["figures", self.row.name], "Draw the figures",
                 subject=self.row.name,

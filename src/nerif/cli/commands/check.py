@@ -10,6 +10,7 @@ import tyro
 from annotated_types import Ge
 
 from nerif.analysis.consistency import Consistency, check_consistency, corrected
+from nerif.analysis.consistency_file import CheckFindings, read_findings, write_findings
 from nerif.analysis.film_check import check_film
 from nerif.analysis.rig_check import RigCheck, check_rig
 from nerif.cli.arguments import check_output
@@ -54,6 +55,9 @@ class Check(Settings):
     """With --refine: time limit in seconds."""
     out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
     """Corrected measurement to write, NAME.nc, without its images of the pattern."""
+    findings: Path | None = None
+    """File NAME.json to write: agreement of each view, faults, notes. Earlier findings of the same measurement are
+    replaced."""
     force: bool = False
     """Overwrite an existing file."""
     strict: bool = False
@@ -66,6 +70,8 @@ def run(settings: Check) -> Consistency | RigCheck:
         if settings.refine:
             raise InputError("expected none with --refine, which corrects nothing; leave one out", field="out")
         check_output(settings.out, settings.force, endings=(".nc",))
+    if settings.findings is not None:
+        _check_findings_file(settings.findings, settings)
     film = MeasurementSequence.read(settings.measurement) if ending(settings.measurement) == ".zarr" else None
     if film is not None and settings.out is not None:
         raise InputError("expected none for a measurement over time, which is not corrected; leave it out", field="out")
@@ -82,7 +88,32 @@ def run(settings: Check) -> Consistency | RigCheck:
     if settings.out is not None and isinstance(result, Consistency):
         corrected(measurement, result).write(settings.out)
         say(f"{settings.out}: corrected measurement; check it again")
+    if settings.findings is not None and isinstance(result, Consistency):
+        write_findings(settings.findings, CheckFindings.of(str(settings.measurement), result))
+        say(f"{settings.findings}: findings")
     return result
+
+
+def _check_findings_file(path: Path, settings: Check) -> None:
+    """Check --findings before the work: its name, and that only earlier findings of this measurement are replaced."""
+    if settings.refine:
+        raise InputError("expected none with --refine, which prints its table; leave one out", field="findings")
+    if ending(path) != ".json":
+        raise InputError(f"expected a name ending in .json, got '{path.name}'", field="findings")
+    if not path.parent.is_dir():
+        raise InputError(f"the folder {path.parent} does not exist; create it", field="findings")
+    if path.exists() and not settings.force and not _is_earlier(path, settings.measurement):
+        raise InputError(
+            f"{path} exists already and was left as it is; give another --findings, or --force", field="findings"
+        )
+
+
+def _is_earlier(path: Path, measurement: Path) -> bool:
+    """Whether a file holds earlier findings of this measurement."""
+    try:
+        return read_findings(path).measurement == str(measurement)
+    except (InputError, OSError):
+        return False
 
 
 def _rig(settings: Check, measurement: Measurement) -> RigCheck:
