@@ -139,9 +139,9 @@ def _certificate_files(shared: Path) -> Iterator[Security]:
     temporary = _certificate()
     with tempfile.TemporaryDirectory(prefix=".nerif-", dir=shared, ignore_cleanup_errors=True) as folder:
         certificate, key = Path(folder) / "certificate.pem", Path(folder) / "key.pem"
-        certificate.write_text(temporary.tls_ca_file)
+        certificate.write_text(temporary.tls_ca_file, encoding="utf-8")
         key.touch(0o600)
-        key.write_text(temporary.tls_worker_key)
+        key.write_text(temporary.tls_worker_key, encoding="utf-8")
         files = {f"tls_{role}_cert": str(certificate) for role in ("client", "scheduler", "worker")}
         files |= {f"tls_{role}_key": str(key) for role in ("client", "scheduler", "worker")}
         yield Security(require_encryption=True, tls_ca_file=str(certificate), **files)
@@ -230,7 +230,7 @@ def read_slurm(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise InputError(f"expected local, tcp://HOST:PORT or a YAML file for SLURM, got '{path}'", field="cluster")
     try:
-        content = yaml.safe_load(path.read_text())
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise InputError(f"not a YAML file ({' '.join(str(error).split())})", field=path) from None
     if not isinstance(content, dict):
