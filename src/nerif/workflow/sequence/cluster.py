@@ -159,7 +159,10 @@ def _local_cluster(workers: int, dashboard: bool = False) -> Any:
         **common, "nthreads": 1, "memory_limit": 0, "dashboard": False,
         "silence_logs": logging.CRITICAL,  # errors of tasks are returned; a heartbeat may fail at the end
     }  # fmt: skip
-    environments = [{"CUDA_VISIBLE_DEVICES": gpus[i % len(gpus)]} if gpus else {} for i in range(workers)]
+    # Windows inherits no empty variable, without which Numba reads .numba_config.yaml of the current folder (cli.py)
+    caches = {"NUMBA_CACHE_DIR": os.environ.get("NUMBA_CACHE_DIR", "")}
+    devices = [{"CUDA_VISIBLE_DEVICES": gpus[i % len(gpus)]} if gpus else {} for i in range(workers)]
+    environments = [caches | device for device in devices]
     nannies = {i: {"cls": Nanny, "options": {**options, "env": env}} for i, env in enumerate(environments)}
     scheduler = {"cls": Scheduler, "options": {**common, "dashboard": dashboard}}
     return SpecCluster(workers=nannies, scheduler=scheduler, security=security, silence_logs="ERROR")
