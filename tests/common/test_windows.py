@@ -10,6 +10,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -20,6 +21,7 @@ from nerif.cli.closed_output import is_closed_output
 from nerif.common import files
 from nerif.imaging.masks import MaskShape, write_masks
 from nerif.reconstruction.base import State
+from nerif.reconstruction.device import peak_memory
 from nerif.reconstruction.files import CHECKPOINT, read_state, write_state
 from refusals import refused
 
@@ -28,7 +30,7 @@ MAPS = Path("/proc/self/maps")
 """Files mapped into the memory of this process, on Linux."""
 
 AS_ON_WINDOWS = """
-import multiprocessing, os, signal, sys, warnings
+import multiprocessing, os, signal, sys, types, warnings
 
 if __name__ == "__main__":
     # first all packages of others: on Windows they have other code
@@ -41,6 +43,7 @@ if __name__ == "__main__":
         delattr(os, name)
     for name in [n for n in dir(signal) if n.startswith("SIG") and n not in WINDOWS_HAS]:
         delattr(signal, name)
+    psutil.Process.memory_info = lambda process: types.SimpleNamespace(peak_wset=1 << 30)
     multiprocessing.get_all_start_methods = lambda: ["spawn"]
     warnings.filterwarnings("error", category=EncodingWarning, module=r"nerif\\.")
     from nerif.cli.cli import main
@@ -135,6 +138,13 @@ def test_names_of_views_that_no_file_can_have(tmp_path: Path, monkeypatch: pytes
     with refused("view"):
         write_masks(tmp_path / "masks", drawing, {name: (12, 20)})
     assert not list(tmp_path.iterdir())
+
+
+def test_peak_memory_without_the_module_resource(monkeypatch: pytest.MonkeyPatch) -> None:
+    process = SimpleNamespace(memory_info=lambda: SimpleNamespace(peak_wset=1 << 30))
+    monkeypatch.setattr("psutil.Process", lambda: process)
+    monkeypatch.setitem(sys.modules, "resource", None)
+    assert peak_memory(torch.device("cpu")) == 1 << 30
 
 
 class Closed(io.TextIOWrapper):
