@@ -2,6 +2,7 @@
 # make test   set up, run the tests, with lint, types and the order of the rooms beside them (make test-all: the long ones too)
 # make app    set up, and work on out/demo (make demo) in the browser
 # make docs   the documentation site: open docs/_build/html/index.html
+# make dist   wheel and sdist in dist/, built and checked as the release workflow does
 # make study  the paper's numerical study (hours; benchmarks/study): out/study; make study-quick: a small one, out/study-quick
 
 PYTHON ?= python3
@@ -9,7 +10,7 @@ BIN := .venv/bin
 PIP := --quiet --disable-pip-version-check --no-compile  # byte code is written at the first import
 PYTEST := $(BIN)/python -m pytest -n 2 --dist loadgroup --no-loadscope-reorder
 
-.PHONY: demo app test test-all short-tests all-tests lint docs study study-quick clean
+.PHONY: demo app test test-all short-tests all-tests lint docs dist study study-quick clean
 
 demo: .venv/.run
 	$(BIN)/nerif demo --out out/demo --force
@@ -38,15 +39,25 @@ lint: .venv/.dev
 docs: .venv/.dev
 	$(BIN)/python -m sphinx -q -W --keep-going -b html docs docs/_build/html
 
+dist: .venv/.dist
+	rm -rf dist
+	$(BIN)/python -m build
+	$(BIN)/python -m twine check --strict dist/*
+	$(BIN)/check-wheel-contents dist/*.whl
+	ls -l dist
+
 study: .venv/.dev
 	$(BIN)/python -m benchmarks run study --out out/study --data out/study --resume
 
 study-quick: .venv/.dev
 	$(BIN)/python -m benchmarks run study --quick --out out/study-quick --data out/study-quick --resume
 
-.venv/.run: pyproject.toml constraints.txt
+.venv/.made: pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "nerif needs Python 3.11 or newer; try make PYTHON=python3.11")'
 	$(PYTHON) -m venv .venv
+	touch $@
+
+.venv/.run: .venv/.made
 	$(BIN)/python -m pip install $(PIP) -c constraints.txt torch
 	$(BIN)/python -m pip install $(PIP) -c constraints.txt -e .
 	touch $@
@@ -59,5 +70,9 @@ study-quick: .venv/.dev
 	$(BIN)/python -m pip install $(PIP) -c constraints.txt -e '.[dev]'
 	touch $@
 
+.venv/.dist: .venv/.made
+	$(BIN)/python -m pip install $(PIP) -c constraints.txt build twine check-wheel-contents
+	touch $@
+
 clean:
-	rm -rf .venv out docs/_build docs/_drawings docs/notebooks docs/repository
+	rm -rf .venv build dist out docs/_build docs/_drawings docs/notebooks docs/repository

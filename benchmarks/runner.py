@@ -93,7 +93,7 @@ def machine() -> str:
 def commit(checkout: Path = ROOT) -> str:
     """Return the commit of a checkout, or "unknown" outside of git."""
     command = ["git", "-C", str(checkout), "describe", "--always", "--dirty", "--exclude", "*"]
-    result = subprocess.run(command, capture_output=True, text=True)
+    result = subprocess.run(command, capture_output=True, text=True, encoding="utf-8")
     return result.stdout.strip() or "unknown"
 
 
@@ -123,7 +123,7 @@ def title(case: Settings) -> str:
 
 def read_records(path: Path) -> list[Record]:
     """Return the records of a file of JSON lines, of which there may be none yet."""
-    return [json.loads(line) for line in path.read_text().splitlines()] if path.is_file() else []
+    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()] if path.is_file() else []
 
 
 def latest(records: Iterable[Record]) -> list[Record]:
@@ -239,7 +239,7 @@ def write_page(name: str, path: Path, cases: Sequence[Settings], records: Sequen
     quick = " --quick" if path.stem.endswith("-quick") else ""
     command = f"Command: `python -m benchmarks run {name}{quick}`"
     blocks = [f"# {head.rstrip('.')}", text.strip(), command, *blocks_of(module, records), origins(latest(records))]
-    path.write_text("\n\n".join(block for block in blocks if block) + "\n")
+    path.write_text("\n\n".join(block for block in blocks if block) + "\n", encoding="utf-8")
     return path
 
 
@@ -294,7 +294,7 @@ def run(
 def append(path: Path, record: Record) -> None:
     """Append a record to a file of JSON lines."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("a") as file:
+    with path.open("a", encoding="utf-8") as file:
         file.write(json.dumps(plain(record), allow_nan=False) + "\n")
 
 
@@ -347,7 +347,9 @@ def worktree(revision: str) -> Iterator[Path | None]:
         return
     folder = Path(tempfile.mkdtemp()) / "before"
     git = ["git", "-C", str(ROOT), "worktree"]
-    result = subprocess.run([*git, "add", "--detach", str(folder), revision], capture_output=True, text=True)
+    result = subprocess.run(
+        [*git, "add", "--detach", str(folder), revision], capture_output=True, text=True, encoding="utf-8"
+    )
     if result.returncode:
         raise InputError(f"expected a revision of this repository, got '{revision}'", field="against")
     try:
@@ -369,7 +371,7 @@ def _elsewhere(name: str, case: Settings, data: Path, checkout: Path) -> Record:
     command = [sys.executable, "-m", "benchmarks", "case", name, json.dumps(case), "--data", str(data)]
     paths = os.pathsep.join([str(checkout / "src"), *filter(None, [os.environ.get("PYTHONPATH")])])
     result = subprocess.run(
-        command, env={**os.environ, "PYTHONPATH": paths}, cwd=ROOT, stdout=subprocess.PIPE, text=True
+        command, env={**os.environ, "PYTHONPATH": paths}, cwd=ROOT, stdout=subprocess.PIPE, text=True, encoding="utf-8"
     )
     if result.returncode:
         return {"failed": f"its process ended with exit code {result.returncode}"}

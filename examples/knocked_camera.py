@@ -56,7 +56,7 @@ for name, rig, refine in (("good", "good", ()), ("knocked", "knocked", ()), ("re
     more = ("--from", "displacements", *(("--refine", *refine, *SIGMA) if refine else ()))
     nerif("reconstruct", out / f"{rig}.nc", "-o", out / name, "--time-limit", seconds, "--voxels", 64, "--force", *more)
     nerif("evaluate", out / name, "--truth", images / "truth" / "volume.nc", "--align", "rigid")
-    metrics = json.loads((out / name / "metrics.json").read_text())
+    metrics = json.loads((out / name / "metrics.json").read_text(encoding="utf-8"))
     errors[name] = (metrics["l2"], metrics["aligned"]["l2"])
 
 print(f"{'cameras':<10}{'L2':>9}{'aligned':>9}")

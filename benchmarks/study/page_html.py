@@ -66,7 +66,7 @@ def render(text: str, images: Mapping[str, str]) -> str:
             if child.type == "image":
                 child.attrSet("src", images.get(str(child.attrGet("src")), ""))
     body: str = parser.renderer.render(tokens, parser.options, {})
-    style = (ASSETS / "report.css").read_text() + STYLE
+    style = (ASSETS / "report.css").read_text(encoding="utf-8") + STYLE
     return PAGE.format(title=html.escape(title), style=style, body=_dress(body, "\n".join(contents)))
 
 

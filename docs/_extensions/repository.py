@@ -35,7 +35,7 @@ def api_pages(docs: Path) -> dict[str, str]:
 
     rows = [f"| `{name}` | {kind.title} | {kind.about()} |" for name, kind in METHODS.items()]
     methods = "\n".join(["| `--method` | name | description |", "|---|---|---|", *rows])
-    pages = {path.stem: path.read_text() for path in sorted((docs / "api").glob("*.md"))}
+    pages = {path.stem: path.read_text(encoding="utf-8") for path in sorted((docs / "api").glob("*.md"))}
     named = {m for text in pages.values() for m in re.findall(r"automodule:: (\S+)", text)} | INTERNAL
 
     def rest(match: re.Match[str]) -> str:
@@ -78,11 +78,11 @@ def relink(text: str, folder: Path, docs: Path, modules: set[str]) -> str:
 
 def write(path: Path, text: str) -> None:
     """Write a page unless it is there already as it should be."""
-    if path.is_file() and path.read_text() == text:
+    if path.is_file() and path.read_text(encoding="utf-8") == text:
         return
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_suffix(f".{os.getpid()}")
-    temporary.write_text(text)
+    temporary.write_text(text, encoding="utf-8")
     temporary.replace(path)
 
 
@@ -100,7 +100,7 @@ def make_pages(app: Any) -> None:
         write(docs / "repository" / name, text)
 
     for path in sorted((root / "benchmarks" / "results").rglob("*.md")):
-        page(path.relative_to(root).as_posix(), relink(path.read_text(), path.parent, docs, modules))
+        page(path.relative_to(root).as_posix(), relink(path.read_text(encoding="utf-8"), path.parent, docs, modules))
     for path in [*sorted((root / "benchmarks").glob("[!_]*.py")), *sorted((root / "examples").glob("*.py"))]:
         inside = path.relative_to(root)
         source = f"```{{literalinclude}} /{os.path.relpath(path, docs)}\n```\n"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import os
 import shutil
 import signal
 from contextlib import nullcontext, redirect_stdout
@@ -163,7 +162,7 @@ def test_ctrl_c_in_the_second_trial_keeps_the_first_and_resumes(path, result, tm
     out, progress_bar = tmp_path / "r", output.progress_bar
 
     def interrupting(title):
-        interrupt = nullcontext(lambda step: os.kill(os.getpid(), signal.SIGINT))
+        interrupt = nullcontext(lambda step: signal.raise_signal(signal.SIGINT))
         return interrupt if "trial 2" in title else progress_bar(title)
 
     monkeypatch.setattr(output, "progress_bar", interrupting)

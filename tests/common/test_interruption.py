@@ -140,9 +140,9 @@ def test_a_note_of_a_step_is_one_line(capsys):
 
 def test_a_signal_ends_a_command_without_a_traceback(tmp_path):
     code = (
-        "import os, signal, sys, nerif.cli.commands.info as info, nerif.cli.cli\n"
+        "import signal, sys, nerif.cli.commands.info as info, nerif.cli.cli\n"
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # ignored in background jobs
-        "info.main = lambda words: os.kill(os.getpid(), signal.SIGINT)\n"
+        "info.main = lambda words: signal.raise_signal(signal.SIGINT)\n"
         "sys.exit(nerif.cli.cli.main(['info', '.']))\n"
     )
     process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)

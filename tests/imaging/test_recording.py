@@ -229,6 +229,13 @@ def test_processes_start_without_a_fork_server(monkeypatch):
     assert workers.start_method() == "spawn"
 
 
+@pytest.mark.slow
+def test_spawned_processes_give_the_results_of_one(recording, monkeypatch):
+    monkeypatch.setattr(workers, "get_all_start_methods", lambda: ["spawn"])
+    one, two = (measure_instant(recording, processes=n)[0].displacement.nan_to_num() for n in (1, 2))
+    assert torch.equal(one, two)
+
+
 def test_averaging_lowers_sigma(recording):
     one, three = (measure_instant(recording, numbers)[0] for numbers in ((0,), (0, 1, 2)))
     assert float(three.sigma.median()) < 0.9 * float(one.sigma.median())

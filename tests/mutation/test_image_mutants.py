@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import random
-import resource
 import shutil
 import time
 from collections.abc import Callable
@@ -11,12 +10,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from imaging_files import CIHX, packed, write_b16, write_cine, write_cv, write_dng, write_packed_tiff
 from mutation.mutators import spoil_bytes, spoil_text
 from nerif.common.conventions import InputError
 from nerif.imaging.readers.frames import Frames
 from nerif.imaging.readers.open import open_frames
+from nerif.reconstruction.device import peak_memory
 
 STACK = np.random.default_rng(3).integers(0, 4096, (3, 24, 33)).astype(np.uint16)
 QUICK = 12
@@ -178,12 +179,12 @@ def problem(path: Path) -> str:
 def problems(good: Path, kind: str, numbers: range, folder: Path) -> list[str]:
     """A line about each mutant that was not treated well."""
     lines: list[str] = []
-    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    memory = peak_memory(torch.device("cpu"))
     for number in numbers:
         path, done = mutant(good, kind, number, folder)
         wrong = problem(path)
         lines += [f"{kind} mutant {number} ({done}): {wrong}"] if wrong else []
-    grown = 1024 * (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - memory)
+    grown = peak_memory(torch.device("cpu")) - memory
     return lines + ([f"{kind}: {grown / 2**30:.1f} GiB more memory"] if grown > MOST_MEMORY else [])
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import signal
 from contextlib import nullcontext
 from dataclasses import replace
@@ -115,7 +114,7 @@ def test_the_command_line_resumes_the_short_run(measurement, tmp_path, capsys, m
         def update(step: Step) -> None:
             if not signals:
                 signals.append(title)
-                os.kill(os.getpid(), signal.SIGINT)
+                signal.raise_signal(signal.SIGINT)
 
         return nullcontext(update)
 

@@ -6,6 +6,7 @@ import multiprocessing
 import os
 import random
 import signal
+import sys
 import time
 from pathlib import Path
 
@@ -22,6 +23,9 @@ from nerif.results.directory import ResultDirectory
 from nerif.workflow.job import Run
 from nerif.workflow.pipeline import reconstruct_into
 from nerif.workflow.steps import CLOSING, STEPS
+
+if sys.platform == "win32":
+    pytest.skip("kills processes by a POSIX signal", allow_module_level=True)
 
 CONTEXT = multiprocessing.get_context("forkserver")
 PRELOADED = ["pytest", "xarray", "h5netcdf", "scipy.ndimage", "matplotlib.figure", "nerif.workflow.steps"]

@@ -70,7 +70,8 @@ def check_arguments(command: str, arguments: list[str]) -> None:
 def _check_options(command: str, words: list[str]) -> None:
     values, (variant, _) = dict(_options(words)), VARIANTS.get(command, ("", ""))
     choice = values.get(variant)
-    options = json.loads(OPTIONS.read_text()).get(f"{command} {variant} {choice}" if choice else command)
+    commands = json.loads(OPTIONS.read_text(encoding="utf-8"))
+    options = commands.get(f"{command} {variant} {choice}" if choice else command)
     if options is None or (variant and values.keys() & {*FILES}):
         return  # a method that is not in the table yet, or one from a file
     see = f"; see nerif {command} --help"
@@ -210,4 +211,4 @@ def _values(default: object) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    OPTIONS.write_text(json.dumps(table(), indent=1) + "\n")
+    OPTIONS.write_text(json.dumps(table(), indent=1) + "\n", encoding="utf-8")

@@ -51,9 +51,11 @@ def main(arguments: list[str] | None = None) -> int:
             arguments = sys.argv[1:]
         code = _run(list(arguments))
         sys.stdout.flush()
-    except BrokenPipeError:  # nerif info FILE | head -2
-        from nerif.cli.commands.output import silence
+    except OSError as error:
+        from nerif.cli.closed_output import is_closed_output, silence
 
+        if not is_closed_output(error):
+            raise
         silence()
         return 141
     return code
@@ -103,9 +105,11 @@ def _run(words: list[str]) -> int:
         return 130
     except SystemExit as stop:
         return int(stop.code or 0)
-    except BrokenPipeError:
-        raise
     except OSError as error:
+        from nerif.cli.closed_output import is_closed_output
+
+        if is_closed_output(error):
+            raise
         return _fail(f"{error.filename or 'file'}: {error.strerror or error}")
     return 0
 

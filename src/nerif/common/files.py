@@ -8,6 +8,7 @@ import math
 import os
 import re
 import shutil
+import time
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -16,12 +17,19 @@ from typing import Any
 
 from nerif.common.conventions import InputError
 
-__all__ = ["atomic", "check_known", "ending", "local_path", "read_toml", "write_json", "write_toml", "written"]
+__all__ = [
+    "WINDOWS", "atomic", "check_known", "ending", "is_file_name", "local_path", "read_toml", "write_json", "write_toml",
+    "written",
+]  # fmt: skip
 
+WINDOWS = os.name == "nt"
 CONTROL = re.compile(r"[\x00-\x1f]")
 """Characters of no path: \\t, \\n and others that TOML makes of C:\\tmp\\new in double quotes."""
 DRIVE = re.compile(r"[A-Za-z]:[\\/]|\\\\")
 """Beginning of an absolute path of Windows."""
+RESERVED = re.compile(r'[<>:"|?*]|[. ]$|^(con|prn|aux|nul|com\d|lpt\d)(\.|$)', re.IGNORECASE)
+"""Signs and names of no file of Windows; cam:1.png is there a hidden stream of the file cam."""
+ATTEMPTS_AFTER = (0.05, 0.1, 0.2, 0.4, 0.8)  # s, to rename a file over one that is open
 ESCAPES = "in double quotes a backslash begins an escape: write paths with /, or in single quotes"
 
 written: list[Path] = []
@@ -38,7 +46,7 @@ def local_path(path: str | os.PathLike[str], base: Path, field: object) -> Path:
     text = os.fspath(path)
     if bad := CONTROL.search(text):
         raise InputError(f"expected a path, got {text!r} with {bad[0]!r} in it; {ESCAPES}", field=field)
-    if os.name == "nt" or ("\\" not in text and not DRIVE.match(text)) or (base / text).exists():
+    if WINDOWS or ("\\" not in text and not DRIVE.match(text)) or (base / text).exists():
         return Path(text)
     if DRIVE.match(text):
         raise InputError(
@@ -47,6 +55,13 @@ def local_path(path: str | os.PathLike[str], base: Path, field: object) -> Path:
             field=field,
         )
     return Path(text.replace("\\", "/"))
+
+
+def is_file_name(name: str) -> bool:
+    """Return whether a text can be the name of a file on this system, not a path."""
+    if name in ("", ".", "..") or "/" in name or "\\" in name or CONTROL.search(name):
+        return False
+    return not (WINDOWS and RESERVED.search(name))
 
 
 @contextmanager
@@ -63,10 +78,24 @@ def atomic(path: str | os.PathLike[str]) -> Iterator[Path]:
         yield part
         if part.is_dir():
             _remove(path)
-        os.replace(part, path)
+        _replace(part, path)
         written.append(path)
     finally:
         _remove(part)
+
+
+def _replace(part: Path, path: Path) -> None:
+    """Rename a file over another; on Windows, wait until programs such as a virus scanner have closed the other one."""
+    for pause in ATTEMPTS_AFTER if WINDOWS else ():
+        try:
+            return os.replace(part, path)
+        except PermissionError:
+            time.sleep(pause)
+    try:
+        os.replace(part, path)
+    except PermissionError as error:
+        reason = "cannot be replaced; close it in other programs, or choose another name"
+        raise PermissionError(error.errno, reason, str(path)) from None
 
 
 def _remove(path: Path) -> None:
@@ -107,7 +136,7 @@ def check_known(words: Iterable[str], names: Iterable[str], where: str, what: st
 def write_json(path: Path, entries: Mapping[str, Any]) -> None:
     """Write a JSON file atomically; NaN and infinity become null."""
     with atomic(path) as part:
-        part.write_text(json.dumps(_plain(entries), indent=2, allow_nan=False) + "\n")
+        part.write_text(json.dumps(_plain(entries), indent=2, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def _plain(value: Any) -> Any:

@@ -88,7 +88,7 @@ class OwnFiles:
     def _entries(self) -> dict[str, dict[str, Any]]:
         """Entries of the list by name; names outside the directory are ignored."""
         try:
-            entries = json.loads((self.directory / WRITTEN).read_text())["files"]
+            entries = json.loads((self.directory / WRITTEN).read_text(encoding="utf-8"))["files"]
             return {name: dict(entry) for name, entry in entries.items() if Path(name).name == name}
         except (OSError, ValueError, KeyError, TypeError, AttributeError):
             return {}

@@ -137,7 +137,7 @@ def _is_view(folder: Path) -> bool:
 
 def _of_store(metadata: Path) -> Kind | None:
     try:
-        attributes = json.loads(metadata.read_text())["attributes"]
+        attributes = json.loads(metadata.read_text(encoding="utf-8"))["attributes"]
     except (ValueError, KeyError, TypeError):
         return None
     if known_conventions(attributes.get("Conventions")):

@@ -58,7 +58,7 @@ def check_store(path: Path, kind: tuple[str, str]) -> None:
         return
     content, mark = kind
     try:
-        metadata = json.loads((path / "zarr.json").read_text())
+        metadata = json.loads((path / "zarr.json").read_text(encoding="utf-8"))
         same_kind = mark in metadata["attributes"] or (path / mark / "zarr.json").is_file()
     except (OSError, ValueError, KeyError, TypeError):
         same_kind = False

@@ -13,7 +13,7 @@ from annotated_types import Ge
 from jaxtyping import Bool, Shaped
 
 from nerif.common.conventions import InputError, unit_shown
-from nerif.common.files import atomic, ending
+from nerif.common.files import atomic, ending, is_file_name
 from nerif.common.image_names import FOLDER_SUFFIXES
 from nerif.common.settings import NonNegative, Positive, check_settings
 from nerif.data.measurement import Measurement, Observation, integrals_of
@@ -90,8 +90,8 @@ def write_masks(
     from PIL import Image
 
     for name in drawings:
-        if name in ("", ".", "..") or any(sign in name for sign in "/\\\0"):
-            raise InputError(f"expected names without / and \\, usable as file names, got {name!r}", field="view")
+        if not is_file_name(name):
+            raise InputError(f"expected names that files can have, without / and \\, got {name!r}", field="view")
     masks = {name: mask_of(drawing, shapes[name]) for name, drawing in drawings.items() if drawing}
     for name, mask in masks.items():
         if mask.all() or not mask.any():

@@ -164,11 +164,10 @@ def print_pattern(path: Path, pattern: Background | CalibrationTarget, dpi: floa
     raster = pattern.raster(pixel)
     with atomic(path) as part:
         if ending(path) == ".png":
-            import imageio.v3 as iio
+            from PIL import Image
 
             resolution = 25.4 / pixel
-            values = np.round(raster * 255).astype(np.uint8)
-            iio.imwrite(part, values, extension=".png", dpi=(resolution, resolution))
+            Image.fromarray(np.round(raster * 255).astype(np.uint8)).save(part, "PNG", dpi=(resolution, resolution))
         else:
             _page(raster, pixel, pattern.label).savefig(part)
 

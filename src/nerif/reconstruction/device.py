@@ -169,7 +169,7 @@ def _used() -> Used | None:
 def _quota() -> int:
     """The number of cores that a container may use, by the kernel's limit for its group; sys.maxsize without one."""
     try:
-        quota, period = Path("/sys/fs/cgroup/cpu.max").read_text().split()
+        quota, period = Path("/sys/fs/cgroup/cpu.max").read_text(encoding="utf-8").split()
         return sys.maxsize if quota == "max" else max(1, math.floor(int(quota) / int(period) + MIN_LOAD))
     except (OSError, ValueError):
         return sys.maxsize
@@ -230,8 +230,8 @@ def available_memory(device: torch.device) -> int:
 
     free = int(psutil.virtual_memory().available)
     try:
-        limit = Path("/sys/fs/cgroup/memory.max").read_text().strip()
-        used = int(Path("/sys/fs/cgroup/memory.current").read_text())
+        limit = Path("/sys/fs/cgroup/memory.max").read_text(encoding="utf-8").strip()
+        used = int(Path("/sys/fs/cgroup/memory.current").read_text(encoding="utf-8"))
         return free if limit == "max" else min(free, max(0, int(limit) - used))
     except (OSError, ValueError):  # no such limit
         return free
@@ -244,7 +244,9 @@ def peak_memory(device: torch.device) -> int:
     try:
         import resource
     except ImportError:  # Windows
-        return 0
+        import psutil
+
+        return int(psutil.Process().memory_info().peak_wset)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return int(peak if sys.platform == "darwin" else peak * 1024)
 

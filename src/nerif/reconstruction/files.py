@@ -227,6 +227,7 @@ def _load(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
     try:
         with safe_open(path, framework="pt") as file:
             about = json.loads((file.metadata() or {})["nerif"])
-            return {name: file.get_tensor(name) for name in file.keys()}, about  # noqa: SIM118
+            # copies: Windows replaces no file that is mapped into memory, as a checkpoint after --resume
+            return {name: file.get_tensor(name).clone() for name in file.keys()}, about  # noqa: SIM118
     except (SafetensorError, OSError, KeyError, ValueError) as error:
         raise InputError(f"damaged or not written by nerif ({error})", field=path) from None

@@ -91,11 +91,15 @@ def render_page(scene: dict[str, Any] | None, **parts: Any) -> str:
         scene=scene,
         scene_json=json.dumps(scene, separators=(",", ":")).replace("<", "\\u003c"),  # "</script>" would end it
         citation=CITATION,
-        style=(ASSETS / "report.css").read_text(),
-        three=(ASSETS / "three.min.js").read_text(),
-        script="\n".join((ASSETS / name).read_text() for name in ("volume3d.js", "slices.js", "report.js")),
+        style=_assets("report.css"),
+        three=_assets("three.min.js"),
+        script=_assets("volume3d.js", "slices.js", "report.js"),
         **parts,
     )
+
+
+def _assets(*names: str) -> str:
+    return "\n".join((ASSETS / name).read_text(encoding="utf-8") for name in names)
 
 
 @cache  # parsing takes half a second

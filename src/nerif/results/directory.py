@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 from typing import Any, TypeVar
 
 from nerif import __version__
@@ -182,7 +182,7 @@ class ResultDirectory:
     def write_history(self, history: Sequence[Mapping[str, float]]) -> None:
         """Write history.csv, one line per record; columns missing in a record are blank."""
         columns = list(dict.fromkeys(key for record in history for key in record))
-        with self.writing(HISTORY) as path, atomic(path) as part, part.open("w", newline="") as file:
+        with self.writing(HISTORY) as path, atomic(path) as part, part.open("w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, columns, restval="")
             writer.writeheader()
             writer.writerows(history)
@@ -242,7 +242,7 @@ class ResultDirectory:
     def history(self) -> list[dict[str, float]]:
         """Return the records of history.csv, blanks as NaN."""
         path = self.path / HISTORY
-        with path.open(newline="") as file:
+        with path.open(newline="", encoding="utf-8") as file:
             rows = [{k: _number(v) for k, v in row.items() if k is not None} for row in csv.DictReader(file)]
         if rows and not {"seconds", "step"} & set(rows[0]):
             raise InputError(f"expected columns 'seconds' or 'step', got {', '.join(list(rows[0])[:5])}", field=path)
@@ -336,8 +336,8 @@ class ResultDirectory:
         """The truth of an evaluation, at its path or, if both were moved, beside the result."""
         if metrics.truth is None:
             return None
-        path = Path(metrics.truth)
-        places = (path, self.path / path.name, self.path.parent / path.name)
+        path, name = Path(metrics.truth), PureWindowsPath(metrics.truth).name  # with / or \\ between folders
+        places = (path, self.path / name, self.path.parent / name)
         try:
             quantity = field_of(volumes)
             path = next((p for p in places if p.is_file()), places[0])

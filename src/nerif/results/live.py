@@ -211,7 +211,7 @@ def _device(field: Field) -> torch.device:
 def read_live(directory: Path) -> dict[str, Any]:
     """Return live.json of a result directory; empty if there is none."""
     path = directory / LIVE
-    return json.loads(path.read_text()) if path.is_file() else {}
+    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
 
 
 def read_look(directory: Path) -> Look | None:

@@ -249,7 +249,7 @@ class Metrics:
     def read(cls, path: Path) -> Metrics:
         """Read a file."""
         try:
-            entries = json.loads(path.read_text())
+            entries = json.loads(path.read_text(encoding="utf-8"))
         except ValueError as error:
             raise InputError(f"not a JSON file of nerif, or truncated ({error})", field=path) from None
         try:

@@ -52,7 +52,7 @@ class CheckpointedRun:
     def resumable(self) -> bool:
         """Whether the directory has a field or a checkpoint of the same inputs."""
         path = self.directory / INPUTS
-        if self.restart or not path.is_file() or path.read_text() != self._inputs:
+        if self.restart or not path.is_file() or path.read_text(encoding="utf-8") != self._inputs:
             return False
         return self.directory.has(FIELD) or self.directory.has(CHECKPOINT)
 
@@ -93,7 +93,7 @@ class CheckpointedRun:
                 self.directory.files.remove()
                 self.directory.path.mkdir(parents=True, exist_ok=True)
                 with self.directory.writing(INPUTS) as path, atomic(path) as part:
-                    part.write_text(self._inputs)
+                    part.write_text(self._inputs, encoding="utf-8")
                 pending = False
 
         return write

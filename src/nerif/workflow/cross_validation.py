@@ -123,7 +123,7 @@ class CrossValidation:
     def scores(self) -> WithheldRun | None:
         """Return prediction errors and duration, None if there are none yet."""
         path = self._directory / SCORES
-        return json.loads(path.read_text()) if path.is_file() else None
+        return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
 
     @property
     def withheld(self) -> Measurement:

@@ -80,9 +80,11 @@ def workers_of(process: subprocess.Popen | psutil.Process) -> list[psutil.Proces
 @pytest.fixture(scope="module")
 def local() -> Iterator:
     """A client of a local cluster of one worker."""
-    with open_cluster("local", 1) as (client, _):
-        client.wait_for_workers(1)
-        yield client
+    with pytest.MonkeyPatch.context() as patch:
+        patch.delenv("NUMBA_CACHE_DIR", raising=False)  # an empty one, which Windows does not inherit
+        with open_cluster("local", 1) as (client, _):
+            client.wait_for_workers(1)
+            yield client
 
 
 def listening() -> set[tuple[str, int]]:
@@ -133,6 +135,11 @@ def test_a_local_cluster_shows_nothing_by_http(local):
             with pytest.raises((urllib.error.URLError, OSError)) as error:
                 urllib.request.urlopen(f"http://127.0.0.1:{port}/{page}", timeout=5)
             assert getattr(error.value, "code", 404) == 404
+
+
+def test_workers_have_the_empty_variable_that_windows_does_not_inherit(local):
+    """Without it, Numba takes the place of its compiled code from a file of the current folder."""
+    assert list(local.run(os.getenv, "NUMBA_CACHE_DIR").values()) == [""]
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="modes of POSIX")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import sys
 import threading
@@ -10,10 +9,11 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
+from nerif.cli.closed_output import is_closed_output, silence
 from nerif.reconstruction.base import OnStep, Step, compose
 from nerif.reconstruction.progress import Monitor
 
-__all__ = ["MONITOR", "counting_bar", "figures_bar", "say", "silence"]
+__all__ = ["MONITOR", "counting_bar", "figures_bar", "say"]
 
 SAME_SIGNAL = 0.5  # s, within which a second Ctrl-C is the first one, passed on by a launcher such as torchrun
 FIRST_LINE, LINE_INTERVAL = 2.0, 15.0  # s, of progress without a terminal
@@ -28,13 +28,10 @@ def _say_safely(text: str) -> None:
     """Print a line of long work, which continues if standard output is closed."""
     try:
         say(text)
-    except BrokenPipeError:
+    except OSError as error:
+        if not is_closed_output(error):
+            raise
         silence()
-
-
-def silence() -> None:
-    """Discard all further standard output."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 @contextmanager

@@ -282,15 +282,17 @@ def _significant_bits(chunks: dict[bytes, bytes]) -> int | None:
 
 
 class Image(ImageFile):
-    """An image that imageio reads: BMP, JPEG."""
+    """An image that Pillow reads: BMP, JPEG."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
 
     def read(self, i: int) -> np.ndarray:
-        from imageio import v3
+        from PIL import Image as Pillow
 
-        return v3.imread(self._path.read_bytes(), extension=ending(self._path))
+        with Pillow.open(self._path) as image:
+            palette = image.palette if image.mode == "P" else None
+            return np.array(image if palette is None else image.convert(palette.mode))
 
 
 class LaVision(ImageFile):

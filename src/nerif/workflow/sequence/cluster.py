@@ -139,9 +139,9 @@ def _certificate_files(shared: Path) -> Iterator[Security]:
     temporary = _certificate()
     with tempfile.TemporaryDirectory(prefix=".nerif-", dir=shared, ignore_cleanup_errors=True) as folder:
         certificate, key = Path(folder) / "certificate.pem", Path(folder) / "key.pem"
-        certificate.write_text(temporary.tls_ca_file)
+        certificate.write_text(temporary.tls_ca_file, encoding="utf-8")
         key.touch(0o600)
-        key.write_text(temporary.tls_worker_key)
+        key.write_text(temporary.tls_worker_key, encoding="utf-8")
         files = {f"tls_{role}_cert": str(certificate) for role in ("client", "scheduler", "worker")}
         files |= {f"tls_{role}_key": str(key) for role in ("client", "scheduler", "worker")}
         yield Security(require_encryption=True, tls_ca_file=str(certificate), **files)
@@ -159,7 +159,10 @@ def _local_cluster(workers: int, dashboard: bool = False) -> Any:
         **common, "nthreads": 1, "memory_limit": 0, "dashboard": False,
         "silence_logs": logging.CRITICAL,  # errors of tasks are returned; a heartbeat may fail at the end
     }  # fmt: skip
-    environments = [{"CUDA_VISIBLE_DEVICES": gpus[i % len(gpus)]} if gpus else {} for i in range(workers)]
+    # Windows inherits no empty variable, without which Numba reads .numba_config.yaml of the current folder (cli.py)
+    caches = {"NUMBA_CACHE_DIR": os.environ.get("NUMBA_CACHE_DIR", "")}
+    devices = [{"CUDA_VISIBLE_DEVICES": gpus[i % len(gpus)]} if gpus else {} for i in range(workers)]
+    environments = [caches | device for device in devices]
     nannies = {i: {"cls": Nanny, "options": {**options, "env": env}} for i, env in enumerate(environments)}
     scheduler = {"cls": Scheduler, "options": {**common, "dashboard": dashboard}}
     return SpecCluster(workers=nannies, scheduler=scheduler, security=security, silence_logs="ERROR")
@@ -230,7 +233,7 @@ def read_slurm(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise InputError(f"expected local, tcp://HOST:PORT or a YAML file for SLURM, got '{path}'", field="cluster")
     try:
-        content = yaml.safe_load(path.read_text())
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise InputError(f"not a YAML file ({' '.join(str(error).split())})", field=path) from None
     if not isinstance(content, dict):
