@@ -46,9 +46,9 @@ def cases(quick: bool) -> Iterator[Settings]:
         flows = [(phantom, 9, 100, 3) for phantom in ("turbulence", "fire")]
         flows += [(phantom, 9, 100, 1) for phantom in ("flame", "gaussians", "octahedron")]
         flows += [(phantom, views, 100, 1) for phantom in ("turbulence", "fire") for views in (6, 18)]
-    for phantom, views, pixels, seeds in flows:
-        for seed in range(seeds):
-            for method, detail in METHODS:
+    for seed in range(max(seeds for *_, seeds in flows)):
+        for phantom, views, pixels, seeds in flows:
+            for method, detail in METHODS if seed < seeds else ():
                 if method == "tv" and (views != 9 or seed):
                     continue
                 case = {"phantom": phantom, "views": views, "pixels": pixels, "method": method, "detail": detail}

@@ -51,7 +51,7 @@ def write_findings(path: Path, findings: CheckFindings) -> None:
 def read_findings(path: Path) -> CheckFindings:
     """Read findings; InputError for a file of another kind."""
     try:
-        entries = json.loads(path.read_text())
+        entries = json.loads(path.read_text(encoding="utf-8"))
         if not isinstance(entries, dict) or entries.get("format") != FORMAT:
             raise ValueError("another format")
         return CheckFindings(
