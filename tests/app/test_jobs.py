@@ -13,8 +13,9 @@ import psutil
 import pytest
 
 from nerif.app import runner
-from nerif.app.jobs import Job, Jobs, claim, command_line
+from nerif.app.jobs import Job, Jobs, claim
 from nerif.app.result_volumes import film_progress
+from nerif.cli.arguments import command_line
 from nerif.cli.cli import main
 from nerif.common.files import write_json
 from refusals import refused

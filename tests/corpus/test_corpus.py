@@ -10,6 +10,7 @@ import pytest
 import torch
 
 import nerif
+from nerif.analysis.consistency_file import read_findings
 from nerif.data.measurement_sequence import MeasurementSequence
 from nerif.data.volume_sequence import VolumeSequence
 from nerif.reconstruction import files
@@ -61,6 +62,24 @@ def test_films(folder):
     for volumes in (truth, result):
         assert isinstance(volumes, VolumeSequence)
         assert bool(volumes.volume(1, "index_excess").values.isfinite().all())
+
+
+def test_the_project_of_the_app(folder, expected, tmp_path, monkeypatch):
+    """Its runs are listed, but not started: they were queued by another user elsewhere."""
+    if "project" not in expected:
+        pytest.skip("written before the app had one")
+    pytest.importorskip("nicegui")
+    from nerif.app.project import OWN, Project
+    from nerif.app.workspace import Workspace
+
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    workspace = Workspace(Project(folder / "project"))
+    assert workspace.draft("design") == expected["project"]["design"]
+    assert workspace.jobs.at_once == expected["project"]["at_once"]
+    (job,) = workspace.jobs.all()
+    assert (job.state, list(job.arguments)) == ("refused", expected["project"]["run"])
+    findings = read_findings(folder / "project" / OWN / "checks" / "m.json")
+    assert [view.name for view in findings.views] == list(nerif.read(folder / "measurement-1.0.nc").names)
 
 
 def test_a_field_of_a_later_version_is_refused(folder, monkeypatch):

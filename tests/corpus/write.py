@@ -6,14 +6,18 @@ Once per released version; tests/corpus/test_corpus.py reads all archives, so th
 from __future__ import annotations
 
 import json
+import os
 import sys
 import tarfile
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import torch
 
 import nerif
+from nerif.app.project import OWN, Project
+from nerif.app.workspace import Workspace
 from nerif.cli.cli import main
 from nerif.fields.network import NetworkShape
 from nerif.geometry import Box, Grid, Ring
@@ -21,6 +25,9 @@ from nerif.imaging.calibration.cameras_file import CalibratedCamera, write_camer
 from nerif.reconstruction.files import CHECKPOINT
 
 POINTS = [[0.0, 0.0, 0.0], [3.0, -2.0, 4.0], [-6.0, 5.0, -3.0]]  # mm
+PROJECT: dict[str, Any] = {
+    "design": {"views": 5}, "at_once": 2, "run": ["reconstruct", "m.nc", "--out", "results/r", "--live"],
+}  # fmt: skip
 RESULTS = {
     "voxels": nerif.Tikhonov(voxels=8, device="cpu", regularisation=1e-2),
     "neural": nerif.preset("fast", max_steps=3, device="cpu", network=NetworkShape(depth=2, width=8, octaves=2)),
@@ -53,12 +60,26 @@ def write(folder: Path) -> None:
     expected = {name: nerif.ResultDirectory(folder / name).field()[0](POINTS).tolist() for name in RESULTS}
     measurements = {"1.0": plain, "1.1": lens}
     rms = {name: float(m.displacements.nan_to_num().square().mean().sqrt()) for name, m in measurements.items()}
-    about = {"nerif": nerif.__version__, "points": POINTS, "fields": expected, "rms": rms}
+    about = {"nerif": nerif.__version__, "points": POINTS, "fields": expected, "rms": rms, "project": PROJECT}
+    write_project(folder / "project", folder / "measurement-1.0.nc")
     (folder / "expected.json").write_text(json.dumps(about, indent=1))
+
+
+def write_project(folder: Path, measurement: Path) -> None:
+    """Write what nerif app keeps in the folder of a project: drafts of the pages, runs, findings of a check."""
+    folder.mkdir()
+    workspace = Workspace(Project(folder))
+    workspace.keep("design", PROJECT["design"])
+    workspace.jobs.at_once = PROJECT["at_once"]
+    workspace.jobs.add(PROJECT["run"], "a run", "results/r")
+    checks = folder / OWN / "checks"
+    checks.mkdir()
+    assert main(["check", str(measurement), "--voxels", "8", "--findings", str(checks / "m.json")]) == 0
 
 
 if __name__ == "__main__":
     torch.manual_seed(0)
+    os.environ["XDG_STATE_HOME"] = tempfile.mkdtemp()  # the key that signs the runs of a project
     with tempfile.TemporaryDirectory() as temporary:
         write(Path(temporary))
         with tarfile.open(sys.argv[1], "w:gz") as archive:

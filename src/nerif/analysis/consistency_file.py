@@ -57,9 +57,7 @@ def read_findings(path: Path) -> CheckFindings:
         return CheckFindings(
             str(entries["measurement"]),
             tuple(_view(view) for view in entries["views"]),
-            tuple(
-                Finding(str(f["code"]), str(f["sentence"]), tuple(map(str, f["views"]))) for f in entries["findings"]
-            ),
+            tuple(_finding(finding) for finding in entries["findings"]),
             tuple(map(str, entries["remarks"])),
             bool(entries["correctable"]),
         )

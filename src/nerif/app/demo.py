@@ -69,6 +69,6 @@ def render(folder: Path) -> None:
 def _is_complete(mark: Path) -> bool:
     """Whether all images are there: an interrupted start renders them again."""
     try:
-        return bool(json.loads(mark.read_text())["complete"])
+        return bool(json.loads(mark.read_text(encoding="utf-8"))["complete"])
     except (OSError, ValueError, KeyError, TypeError):
         return False

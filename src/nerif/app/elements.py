@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from html import escape
@@ -10,7 +9,7 @@ from typing import Any
 
 from nicegui import ui
 
-from nerif.app.jobs import command_line
+from nerif.cli.arguments import command_line, quoted
 from nerif.common.conventions import InputError
 
 __all__ = [
@@ -147,9 +146,7 @@ class CommandLine:
     def show(self, arguments: Sequence[str]) -> None:
         """Show the command line of these arguments."""
         self.line = command_line(arguments)
-        words = (
-            f"<span>{escape(shlex.quote(word))}</span>" for word in ("nerif", *arguments)
-        )  # lines break between them
+        words = (f"<span>{escape(quoted(word))}</span>" for word in ("nerif", *arguments))  # lines break between them
         self._text.set_content(f"<code tabindex=0>{' '.join(words)}</code>")
 
 

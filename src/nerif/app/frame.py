@@ -62,7 +62,7 @@ class Page:
 
 @cache
 def _style() -> str:
-    return (ASSETS / "app.css").read_text()
+    return (ASSETS / "app.css").read_text(encoding="utf-8")
 
 
 @contextmanager

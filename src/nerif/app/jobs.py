@@ -18,11 +18,8 @@ from __future__ import annotations
 
 import hmac
 import json
-import os
 import secrets
-import shlex
 import shutil
-import signal
 import subprocess
 import sys
 import threading
@@ -37,8 +34,10 @@ from typing import Any
 from nerif.app.private import secret
 from nerif.app.project import OWN
 from nerif.app.runner import ENDED, JOB, LOG, STARTED
+from nerif.cli.arguments import command_line
 from nerif.common.conventions import InputError
 from nerif.common.files import write_json
+from nerif.common.interruption import interrupt
 from nerif.results.directory import RUN
 
 __all__ = ["REFUSED", "Job", "Jobs", "command_line"]
@@ -53,11 +52,6 @@ REFUSED = (
     "start the run again from its page."
 )
 """Message of a run without a valid signature."""
-
-
-def command_line(arguments: Sequence[str]) -> str:
-    """Return the command line for a shell in the folder of the project."""
-    return shlex.join(["nerif", *arguments])
 
 
 @dataclass(frozen=True)
@@ -283,7 +277,7 @@ class Jobs:
         self._write(replace(job, request=request))
         now = self._read(id)  # it may have started meanwhile; one that starts later reads the request
         if job.state == "running" and now is not None and now.state == "running" and now.pid:
-            os.kill(now.pid, signal.SIGINT)
+            interrupt(now.pid)
 
     def _write(self, job: Job) -> None:
         if job.state == "refused":
@@ -362,7 +356,7 @@ def claim(where: Path, pid: int) -> bool:
 def _json(path: Path) -> dict[str, Any]:
     """Return the entries of a JSON file; none if it is missing, damaged or incomplete."""
     try:
-        content = json.loads(path.read_text())
+        content = json.loads(path.read_text(encoding="utf-8"))
         json.dumps(content, ensure_ascii=False).encode()  # half a surrogate pair cannot be displayed
     except (OSError, ValueError, RecursionError):
         return {}

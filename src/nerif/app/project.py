@@ -87,7 +87,7 @@ class Project:
 
     def relative(self, path: str | os.PathLike[str]) -> str:
         """Return a path relative to the folder, as the command line takes it."""
-        return str(self.path(path).relative_to(self.folder))
+        return self.path(path).relative_to(self.folder).as_posix()
 
     def free_name(self, stem: str, reserved: Collection[str] = ()) -> str:
         """Return the first of stem, stem-2, stem-3, ... that neither exists nor is in `reserved`."""
@@ -114,7 +114,7 @@ class Project:
         names: dict[str, list[str]] = {name: [] for name in Contents.__dataclass_fields__ if name != "unread"}
         unread: list[tuple[str, str]] = []
         for path in self._walk(self.folder, DEPTH, [0], unread):
-            name = str(path.relative_to(self.folder))
+            name = path.relative_to(self.folder).as_posix()
             try:
                 if not path.resolve().is_relative_to(self.folder):
                     continue
@@ -135,7 +135,7 @@ class Project:
         try:
             entries = sorted(os.scandir(folder), key=lambda e: e.name)
         except OSError as error:
-            unread.append((str(folder.relative_to(self.folder)), error.strerror or str(error)))
+            unread.append((folder.relative_to(self.folder).as_posix(), error.strerror or str(error)))
             return
         for entry in entries:
             count[0] += 1

@@ -40,7 +40,7 @@ class Workspace:
         """Return the entries of a page that differ from the defaults; they survive a reload and a restart."""
         if not self._drafts and self._file.is_file():
             try:
-                entries = json.loads(self._file.read_text())
+                entries = json.loads(self._file.read_text(encoding="utf-8"))
             except ValueError:  # damaged: only drafts are lost
                 entries = {}
             drafts = entries if isinstance(entries, dict) else {}

@@ -48,6 +48,7 @@ def main(arguments: list[str] | None = None) -> int:
                 stream.reconfigure(errors="replace")  # a console without Greek letters shows question marks
         if arguments is None:
             _ignore_code_in_the_current_folder()
+            _let_ctrl_break_interrupt()
             arguments = sys.argv[1:]
         code = _run(list(arguments))
         sys.stdout.flush()
@@ -69,6 +70,14 @@ def _ignore_code_in_the_current_folder() -> None:
     """
     os.environ["PYTHONSAFEPATH"] = "1"
     os.environ.setdefault("NUMBA_CACHE_DIR", "")
+
+
+def _let_ctrl_break_interrupt() -> None:
+    """Treat Ctrl-Break of Windows, which ends a process by default, as Ctrl-C."""
+    import signal
+
+    if hasattr(signal, "SIGBREAK"):
+        signal.signal(signal.SIGBREAK, signal.default_int_handler)
 
 
 def _run(words: list[str]) -> int:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import shlex
 import webbrowser
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ from typing import Annotated, Literal
 import tyro
 from annotated_types import Ge
 
+from nerif.cli.arguments import command_line
 from nerif.cli.commands.output import say
 from nerif.cli.commands.settings import Settings, command
 from nerif.common.conventions import InputError
@@ -140,7 +140,7 @@ def run(settings: Demo) -> None:
         sample(settings.name, out)
     for stage in demo.stages:
         words = stage.words(out, settings.steps or demo.steps)
-        say(f"\n$ nerif {shlex.join(words)}")
+        say(f"\n$ {command_line(words)}")
         with ExitStack() as stack:
             for file in stage.files:
                 stack.enter_context(OwnFiles(out, say).writing(file))
@@ -153,8 +153,8 @@ def run(settings: Demo) -> None:
 def _print_next(name: str, out: Path) -> None:
     other = "flame" if name == "jet" else "jet"
     commands = {
-        f"nerif figures {shlex.quote(str(out))}": "figures for print, as PDF and PNG",
-        f"nerif app {shlex.quote(str(out))}": f"in the browser ({install('app')})",
+        command_line(["figures", str(out)]): "figures for print, as PDF and PNG",
+        command_line(["app", str(out)]): f"in the browser ({install('app')})",
         f"nerif demo {other}": f"{DEMOS[other].title} (nerif demo --list: all)",
     }
     say(f"\nReport: {(out / REPORT).resolve().as_uri()}")

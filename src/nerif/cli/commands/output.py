@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from nerif.cli.closed_output import is_closed_output, silence
+from nerif.common.interruption import SIGNALS
 from nerif.reconstruction.base import OnStep, Step, compose
 from nerif.reconstruction.progress import Monitor
 
@@ -47,14 +48,15 @@ def _interruptible() -> Iterator[Callable[[], bool]]:
             raise KeyboardInterrupt
 
     try:
-        before = signal.signal(signal.SIGINT, handler)
+        before = {number: signal.signal(number, handler) for number in SIGNALS}
     except ValueError:  # signals reach the main thread only
         yield lambda: False
         return
     try:
         yield lambda: bool(times)
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, earlier in before.items():
+            signal.signal(number, earlier)
 
 
 @contextmanager
