@@ -87,13 +87,7 @@ HINTS: dict[str, Hint] = {
         "Fill in the values: few steps, and no withheld view, to save time. Press Start. It takes about a minute.",
         "The loss falls, the predicted view approaches the measured one, and the isosurface becomes a flame.",
         "displacement",
-        {
-            "reconstruct": {
-                "method": "nerif",
-                "preset": "fast",
-                "values": {"max_steps": 250, "withhold": ["none"], "voxels": 40},
-            }
-        },
+        {"reconstruct": {"method": "nerif", "preset": "fast", "values": SHORT_RUN}},
     ),
     "results": Hint(
         "Shows the field with its verdict, compares results, and exports them.",
