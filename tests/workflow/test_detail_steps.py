@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 
@@ -16,6 +18,7 @@ from nerif.results.directory import ResultDirectory
 from nerif.simulation.simulate import simulate
 from nerif.workflow.job import Run
 from nerif.workflow.pipeline import reconstruct_into
+from nerif.workflow.steps import MOST_BLURRED, MOST_DETAIL, share
 from refusals import refused
 
 BOX = Box.around_origin((40.0, 36.0, 30.0))
@@ -142,3 +145,12 @@ def test_the_commands_take_a_result_with_detail(made, turbulence, tmp_path):
     words = ["reconstruct", str(path), "-o", again, "--method", "gp", "--voxels", "20", "--no-report"]
     assert main([*words, "--start-from", out]) == 0
     assert ResultDirectory(again).settings()["method"] == "gp"
+
+
+@pytest.mark.parametrize(
+    ("rms", "blurred", "most"), [(0.5, True, MOST_BLURRED), (0.7, True, MOST_DETAIL), (0.5, False, MOST_DETAIL)]
+)
+def test_training_comes_first_after_a_first_run_that_explains_little(rms, blurred, most):
+    scores = {"fitted_views": [{"rms": rms, "rms_measured": 1.0}]}
+    job = SimpleNamespace(validation=SimpleNamespace(scores=lambda: scores))
+    assert share(job, Choice(blurred=blurred)) == most

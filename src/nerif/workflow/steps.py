@@ -39,6 +39,7 @@ from nerif.workflow.reports import write_report
 
 __all__ = ["CLOSING", "STEPS", "PipelineStep"]
 
+EXPLAINED = 0.6  # of the signal by the first run, above which a blurred field may take most of the time
 MOST_DETAIL, MOST_BLURRED = 0.35, 0.7  # of the time that is left; where the field is blurred, its training matters less
 
 
@@ -98,7 +99,7 @@ class ChooseDetail(PipelineStep):
         left = job.budget.left
         choice = ChooseDetail.choice(job, left)
         if choice is not None:
-            most = share(choice) * left
+            most = share(job, choice) * left
             each = choice.seconds or (most if math.isfinite(most) else 0.0)
             draws = job.trials.members if choice.blurred else 0
             job.budget = job.budget.holding(min(each * (1 + draws), most))
@@ -126,7 +127,7 @@ class ChooseDetail(PipelineStep):
             choice = choose(coarse, validation.withheld, math.inf if on else MOST_BLURRED * left, bar)
         errors = f"{choice.before:.2f} sigma without it, {choice.after:.2f} with it"
         job.monitor.say(f"detail: the withheld view is predicted to {errors}")
-        if choice.seconds > share(choice) * left and not on:
+        if choice.seconds > share(job, choice) * left and not on:
             job.monitor.say(f"detail left out: it takes about {choice.seconds:.0f} s; give a longer --time-limit")
             return None
         return choice if choice.pays or on else None
@@ -387,9 +388,20 @@ CLOSING: tuple[type[PipelineStep], ...] = (Judge, WriteReport)
 """Run whatever became of the others, if there is a field."""
 
 
-def share(choice: Choice) -> float:
-    """Return the largest share of the time left that detail may take."""
-    return MOST_BLURRED if choice.blurred else MOST_DETAIL
+def share(job: Job, choice: Choice) -> float:
+    """Return the largest share of the time left that detail may take.
+
+    A first run that explains little of its data does not show what a longer one would leave: training comes first.
+    """
+    return MOST_BLURRED if choice.blurred and _explained(job) > EXPLAINED else MOST_DETAIL
+
+
+def _explained(job: Job) -> float:
+    """Return the share of the squared signal that the first run explains of data that it fitted."""
+    scores = job.validation.scores() if job.validation is not None else None
+    views = [v for v in scores["fitted_views"] if "rms_measured" in v] if scores else []
+    signal = sum(v["rms_measured"] ** 2 for v in views)
+    return 1 - sum(v["rms"] ** 2 for v in views) / signal if signal > 0 else 0.0
 
 
 def has_error_draws(job: Job) -> bool:
