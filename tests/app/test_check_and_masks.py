@@ -67,6 +67,7 @@ def ended(jobs: Jobs, seconds: float) -> Job:
     return job
 
 
+@pytest.mark.slow
 def test_a_comparison_is_a_run_whose_findings_are_shown_and_go_out_of_date(browser, server, folder):
     small = Ring(views=3, arc=(0.0, 100.0), image_size=(12, 14), pixel_pitch=0.3).cameras()
     few = simulate(make_phantom("gaussians", BOX, 1), small, BOX, 1.00027, 0.05, 1, steps=10)

@@ -136,6 +136,7 @@ def test_a_solution_is_stopped(plume):
     assert (stopped.count, stopped.problem.ratio) == (1, 1.0)
 
 
+@pytest.mark.slow
 def test_a_flow_through_lenses():
     truth = TurbulentPlume(BOX, seed=9, shortest=0.07)
     measurement = seen(truth, views=5, pixels=24, f_number=8.0)

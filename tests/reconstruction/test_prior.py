@@ -113,6 +113,7 @@ def test_draws_have_mean_and_covariance_of_the_posterior(white, prior):
     assert float(errors.mean(dim=1).square().sum()) == pytest.approx(size / count, rel=5 * math.sqrt(2 / size))
 
 
+@pytest.mark.slow
 def test_with_the_true_prior_68_and_95_per_cent_lie_within_one_and_two_deviations(problem, prior):
     generator, ratios = torch.Generator().manual_seed(8), []
     for _ in range(25):
