@@ -32,19 +32,13 @@ def main(directory: Path, words: Sequence[str]) -> None:
     environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
     with (directory / LOG).open("ab") as log:
         process = subprocess.Popen(
-            arguments,
-            cwd=directory.parents[2],
-            stdin=subprocess.DEVNULL,
-            stdout=log,
-            stderr=log,
-            env=environment,
+            arguments, cwd=directory.parents[2], stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=environment,
             **OWN_GROUP,
-        )
+        )  # fmt: skip
         began = psutil.Process(process.pid).create_time()
         write_json(directory / STARTED, {"pid": process.pid, "began": began, "time": time.time()})
-        if json.loads((directory / JOB).read_text(encoding="utf-8"))[
-            "request"
-        ]:  # to stop, before this process could get a signal
+        job = json.loads((directory / JOB).read_text(encoding="utf-8"))
+        if job["request"]:  # to stop, before this process could get a signal
             interrupt(process.pid)
         code = process.wait()
     write_json(directory / ENDED, {"code": code, "time": time.time()})

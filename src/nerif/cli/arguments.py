@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from nerif.common.conventions import InputError
-from nerif.common.files import ending
+from nerif.common.files import WINDOWS, ending
 
 __all__ = [
     "ALIASES", "INPUTS", "check_arguments", "check_output", "command_line", "flag_value", "quoted", "table", "words_of",
@@ -168,7 +168,7 @@ def command_line(arguments: Sequence[str]) -> str:
 
 def quoted(word: str) -> str:
     """Return a word as the shell of this system reads it."""
-    if os.name != "nt":
+    if not WINDOWS:
         return shlex.quote(word)
     from subprocess import list2cmdline
 

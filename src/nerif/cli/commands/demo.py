@@ -51,20 +51,24 @@ class Scenario:
     stages: tuple[Stage, ...]
 
 
-def _one_camera(steps: int, name: str, rig: str, options: str) -> Scenario:
-    """Return the way from the images of one camera to a report."""
-    rig = f"calibrate {{out}} --simple {rig} -o {{out}}/camera.toml --force"
+def _one_camera(name: str, steps: int) -> Scenario:
+    """Return the way from the images of one camera, whose lengths are plausible guesses, to a report."""
     return Scenario(
         f"{SAMPLES[name].title} (real data, {SAMPLES[name].licence})",
         steps,
         (
-            Stage(rig, ("camera.toml", "camera.rig.png")),
+            Stage(
+                "calibrate {out} --simple --distance 1000 --background-distance 300 --mm-per-px 0.1 "
+                "-o {out}/camera.toml --force",
+                ("camera.toml", "camera.rig.png"),
+            ),
             Stage(
                 "displacement {out} --calibration {out}/camera.toml -o {out}/measurement.nc --no-images --force",
                 ("measurement.nc", "measurement.png"),
             ),
             Stage(
-                "reconstruct {out}/measurement.nc --out {out} --force --max-steps {steps} --symmetry axis " + options
+                "reconstruct {out}/measurement.nc --out {out} --force --max-steps {steps} --symmetry axis "
+                "--open-faces z- z+ --detail off"
             ),
         ),
     )
@@ -88,18 +92,8 @@ DEMOS = {
             Stage("report {out}"),
         ),
     ),
-    "jet": _one_camera(
-        400,
-        "jet",
-        "--distance 1000 --background-distance 300 --mm-per-px 0.1",
-        "--open-faces z- z+ --detail off",
-    ),
-    "blowtorch": _one_camera(
-        200,
-        "blowtorch",
-        "--distance 1000 --background-distance 300 --mm-per-px 0.1",
-        "--open-faces z- z+ --detail off",
-    ),
+    "jet": _one_camera("jet", 400),
+    "blowtorch": _one_camera("blowtorch", 200),
     "spray": Scenario(
         f"{SAMPLES['spray'].title} (real data, {SAMPLES['spray'].licence})",
         300,
