@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import imageio.v3 as iio
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+from bodies import cuboid
 from nerif.cli.cli import main
 from nerif.fields.phantoms import GaussianBalls
 from nerif.geometry import Box, Ring
@@ -118,3 +120,14 @@ def test_the_command_prints_and_draws(tmp_path, capsys):
         ["-o", str(tmp_path / "x.txt")],
     ):
         assert main(["design", *words]) == 2
+
+
+def test_pixels_that_a_body_hides_are_counted(tmp_path, capsys):
+    import trimesh
+
+    body = cuboid((-5.0, -5.0, -5.0), (5.0, 5.0, 5.0))
+    trimesh.Trimesh(body.vertices.numpy(), body.faces.numpy()).export(tmp_path / "cube.stl")
+    assert main(["design", "--views", "3", "--body", str(tmp_path / "cube.stl")]) == 0
+    shares = re.findall(r"hidden in view \S+ +([\d.]+)%", capsys.readouterr().out)
+    assert len(shares) == 3
+    assert all(1 < float(share) < 90 for share in shares)

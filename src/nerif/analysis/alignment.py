@@ -47,6 +47,7 @@ def aligned(field: Field, truth: Volume) -> MovedField:
     """
     points = truth.grid.points().reshape(-1, 3)
     sample = torch.randperm(len(points), generator=torch.Generator().manual_seed(0))[:MAX_POINTS]
+    sample = sample[truth.values.flatten()[sample].isfinite()]  # not within a body
     points, target = points[sample], truth.values.flatten()[sample].double()
     reach = float(points.norm(dim=1).max())
     result = MovedField(field, torch.zeros(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))

@@ -88,18 +88,8 @@ def halved(measurement: Measurement, symmetry: Symmetry) -> Measurement:
                 cameras.append(replace(camera, name=f"{camera.name} {name}"))
                 valid.append(inside[view] & side)
 
-    def twice(x: Tensor | None) -> Tensor | None:
-        return None if x is None else x[index]
-
-    return replace(
-        measurement,
-        cameras=tuple(cameras),
-        displacement=twice(measurement.displacement),
-        sigma=twice(measurement.sigma),
-        maps={name: value[index] for name, value in measurement.maps.items()},
-        valid=torch.stack(valid),
-        flow_mask=twice(measurement.flow_mask),
-    )
+    picked = measurement.mapped(lambda x: x[index]) | {"valid": torch.stack(valid)}
+    return replace(measurement, cameras=tuple(cameras), **picked)
 
 
 def camera_of(view: str) -> str:

@@ -730,4 +730,5 @@ def _corrected(correction: Correction, measurement: Measurement) -> Measurement:
         return correction.undo(channels, cameras).abs()[..., 0] > 0.5
 
     result = measurement.observed({name: correction.undo(values, cameras)}, {name: sigma})
+    # not the pixels hidden by bodies, which follow from the cameras
     return replace(result, valid=mask(measurement.valid), flow_mask=mask(measurement.flow_mask))

@@ -19,6 +19,7 @@ from nerif.analysis.gains import gains_of, with_gains
 from nerif.analysis.metrics import coverage, slice_metrics, view_metrics, volume_metrics
 from nerif.analysis.prediction import check_sees, reproject
 from nerif.analysis.residuals import white_noise, whiteness
+from nerif.common.arrays import filled
 from nerif.common.conventions import InputError, with_unit
 from nerif.data.measurement import Measurement, Observation
 from nerif.data.reprojection import Reprojection
@@ -28,6 +29,7 @@ from nerif.fields.base import Field
 from nerif.fields.grid import VoxelField
 from nerif.forward.registry import AUTO, forward_model
 from nerif.geometry import Box
+from nerif.geometry.body import contained
 from nerif.plotting.notebook import number
 from nerif.reconstruction.aperture import apply_aperture
 from nerif.reconstruction.rig.parameters import with_corrections
@@ -82,6 +84,8 @@ def evaluate(
         check_sees(data.techniques, quantity, str(measurement))
     if truth is not None:
         compared = _truth(Path(truth), box, n_ambient, quantity)
+        if bodies := directory.bodies():
+            compared = compared.masked(contained(bodies, compared.grid.points()), "within a body")
         metrics |= evaluate_volume(field, compared, n_ambient) | _coverage(directory, compared)
         if align == "rigid":
             metrics["aligned"] = evaluate_aligned(field, compared, n_ambient)
@@ -213,7 +217,7 @@ def check_inside(path: Path, truth: Box, box: Box) -> None:
 
 def _truth(path: Path, box: Box, n_ambient: float, quantity: str) -> Volume:
     """The truth; of an index, as excess over the ambient of the reconstruction."""
-    truth = read_volume(path, None if quantity == INDEX else quantity)
+    truth = read_volume(path, None if quantity == INDEX else quantity, gaps=True)
     check_inside(path, truth.grid.box, box)
     if quantity != INDEX:
         return truth
@@ -233,8 +237,10 @@ def _coverage(directory: ResultDirectory, truth: Volume) -> dict[str, Any]:
     def on_its_grid(volume: Volume) -> Float[Tensor, "z y x"]:
         if volume.grid == truth.grid:
             return volume.values
-        return VoxelField.through(volume.values, volume.grid).sample(truth.grid)
+        return VoxelField.through(torch.from_numpy(filled(volume.values.numpy())), volume.grid).sample(truth.grid)
 
     mean, std = on_its_grid(volumes[quantity]), on_its_grid(volumes[f"{quantity}_std"])
-    flow = truth.values.abs() > FLOW * truth.values.abs().max()
-    return {"coverage": coverage((truth.values - mean).numpy(), std.numpy(), flow.numpy())}
+    outside = (truth.values + mean + std).isfinite()  # of bodies
+    flow, size = truth.values[outside].abs(), truth.values.nan_to_num(0.0).abs().max()
+    error, std = (truth.values - mean)[outside], std[outside]
+    return {"coverage": coverage(error.numpy(), std.numpy(), (flow > FLOW * size).numpy())}

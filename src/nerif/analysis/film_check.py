@@ -37,7 +37,7 @@ from nerif.analysis.consistency import (
 )
 from nerif.common.conventions import InputError
 from nerif.common.findings import Finding
-from nerif.data.measurement import Measurement, integrals_of
+from nerif.data.measurement import MASKS, Measurement, integrals_of
 from nerif.reconstruction.aperture import apply_aperture
 from nerif.reconstruction.device import on_free_cores
 
@@ -388,7 +388,7 @@ def _synchronous(film: Film, instant: int, shifts: Mapping[str, int]) -> Measure
                 return None
             return torch.cat([ours[:i], theirs[j : j + 1], ours[i + 1 :]])
 
-        fields = ("displacement", "sigma", "valid", "flow_mask")
+        fields = ("displacement", "sigma", *MASKS)
         changes: dict[str, Any] = {field: exchanged(getattr(result, field), getattr(later, field)) for field in fields}
         maps: Any = {key: exchanged(value, later.maps[key]) for key, value in result.maps.items()}
         result = replace(result, maps=maps, **changes)

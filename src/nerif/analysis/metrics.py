@@ -36,23 +36,36 @@ def psnr(truth: Float[Array, "*n"], test: Float[Array, "*n"]) -> float:
     return 10 * math.log10(span**2 / error) if error > 0 else float("inf")
 
 
-def ssim(truth: Float[Array, "*n"], test: Float[Array, "*n"]) -> float:
-    """Return the mean structural similarity (paper, Eq. (ssim)) over windows of 7, in 2-D or 3-D."""
+def ssim(
+    truth: Float[Array, "*n"], test: Float[Array, "*n"], valid: Bool[Array, "*n"] | None = None, span: float = 0.0
+) -> float:
+    """Return the mean structural similarity (paper, Eq. (ssim)) over windows of 7, in 2-D or 3-D.
+
+    Parameters
+    ----------
+    valid : windows about these values are counted; invalid ones, which the windows need, are set equal in both
+    span : range of the truth; 0: that of its valid values
+    """
     from skimage.metrics import structural_similarity
 
-    span = float(truth.max() - truth.min())
+    values = truth if valid is None else truth[valid]
+    span = span or (float(values.max() - values.min()) if values.size else 0.0)
     if span == 0 or min(truth.shape) < 7:
         return NAN
-    return float(structural_similarity(truth.astype(np.float64), test.astype(np.float64), data_range=span))
+    if valid is None:
+        return float(structural_similarity(truth.astype(np.float64), test.astype(np.float64), data_range=span))
+    a, b = (np.where(valid, x, 0.0).astype(np.float64) for x in (truth, test))
+    return float(structural_similarity(a, b, data_range=span, full=True)[1][valid].mean())
 
 
 def volume_errors(truth: Float[Array, "z y x"], test: Float[Array, "z y x"], n_ambient: float) -> dict[str, float]:
-    """Compare two volumes of index excess.
+    """Compare two volumes of index excess where the truth is not NaN, as within a body.
 
     l2 = |n_gt - n_rec| / |n_gt - 1| (the paper's; small because n - 1 is mostly the ambient),
     l2_variation = |n_gt - n_rec| / |n_gt - n_ambient|, and cc.
     """
-    gt, rec = truth.astype(np.float64), test.astype(np.float64)
+    valid = np.isfinite(truth)
+    gt, rec = truth[valid].astype(np.float64), test[valid].astype(np.float64)
     error = float(np.linalg.norm(gt - rec))
     variation = float(np.linalg.norm(gt))
     return {
@@ -64,7 +77,9 @@ def volume_errors(truth: Float[Array, "z y x"], test: Float[Array, "z y x"], n_a
 
 def volume_metrics(truth: Float[Array, "z y x"], test: Float[Array, "z y x"], n_ambient: float) -> dict[str, float]:
     """Compare two volumes of index excess: volume_errors, ssim and psnr."""
-    return {**volume_errors(truth, test, n_ambient), "ssim": ssim(truth, test), "psnr": psnr(truth, test)}
+    valid = np.isfinite(truth)
+    similarity = ssim(truth, test, None if valid.all() else valid)
+    return {**volume_errors(truth, test, n_ambient), "ssim": similarity, "psnr": psnr(truth[valid], test[valid])}
 
 
 def slice_metrics(
@@ -73,34 +88,29 @@ def slice_metrics(
     """Return cc, ssim and psnr of equally spaced slices across z; `heights` in mm."""
     nz = truth.shape[0]
     indices = np.unique(((np.arange(slices) + 0.5) * nz / slices).astype(int))
-    scores = {"cc": correlation, "ssim": ssim, "psnr": psnr}
-    return [
-        {"z_mm": float(heights[i]), **{name: score(truth[i], test[i]) for name, score in scores.items()}}
-        for i in indices
-    ]
+    records = []
+    for i in indices:
+        gt, rec, valid = truth[i], test[i], np.isfinite(truth[i])
+        scores = {"cc": NAN, "ssim": ssim(gt, rec, None if valid.all() else valid), "psnr": NAN}
+        if valid.any():
+            scores |= {"cc": correlation(gt[valid], rec[valid]), "psnr": psnr(gt[valid], rec[valid])}
+        records.append({"z_mm": float(heights[i]), **scores})
+    return records
 
 
 def view_metrics(
     measured: Float[Array, "row column c"], predicted: Float[Array, "row column c"], valid: Array
 ) -> dict[str, float]:
-    """Return cc, ssim, psnr and rms difference of a view over the valid pixels.
-
-    For SSIM, which needs whole windows, invalid pixels are set equal in both maps, and windows around them left out.
-    """
-    from skimage.metrics import structural_similarity
-
+    """Return cc, ssim, psnr and rms difference of a view over the valid pixels."""
     if not valid.any():
         return {"cc": NAN, "ssim": NAN, "psnr": NAN, "rms": NAN}
     a, b = measured[valid], predicted[valid]
     rms = float(np.sqrt(np.mean((a - b).astype(np.float64) ** 2)))
     span = float(a.max() - a.min())
+    channels = range(measured.shape[-1])
     similarity = NAN
-    if span > 0 and min(valid.shape) >= 7:
-        maps = []
-        for c in range(measured.shape[-1]):
-            x, y = (np.where(valid, m[..., c], 0).astype(np.float64) for m in (measured, predicted))
-            maps.append(structural_similarity(x, y, data_range=span, full=True)[1][valid])
-        similarity = float(np.mean(maps))
+    if span > 0:
+        similarity = float(np.mean([ssim(measured[..., c], predicted[..., c], valid, span) for c in channels]))
     return {"cc": correlation(a, b), "ssim": similarity, "psnr": psnr(a, b), "rms": rms}
 
 

@@ -314,7 +314,7 @@ def _deviation(result: Result) -> float | None:
     if name is None or std is None:
         return None
     values = result.volumes[name].values.double()
-    flow = values.abs() > FLOW * values.abs().max()
+    flow = values.abs() > FLOW * values.nan_to_num(0.0).abs().max()
     size = float(values[flow].norm())
     return float(std.values.double()[flow].norm()) / size if size > 0 else None
 

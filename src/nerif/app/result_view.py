@@ -23,7 +23,7 @@ from nerif.common.files import ending
 from nerif.data.volume import Volume, describe
 from nerif.plotting.drawing import DIVERGING, LABELS, map_range
 from nerif.report.slice_images import colours_of
-from nerif.results.directory import VOLUME
+from nerif.results.directory import SURFACE, VOLUME
 
 __all__ = ["ResultView"]
 
@@ -206,7 +206,9 @@ class ResultView:
     def _surface_of(self, name: str, frame: int) -> Surface:
         path = self.work.project.path(name)
         file = path / ("zarr.json" if ending(path) == ".zarr" else VOLUME)
-        return Surface(name, self.work.project.title(name), frame, file.stat().st_mtime_ns if file.is_file() else 0)
+        bodies = (path / SURFACE[0]).is_file()
+        stamp = file.stat().st_mtime_ns if file.is_file() else 0
+        return Surface(name, self.work.project.title(name), frame, stamp, bodies)
 
 
 def _interval(times: Sequence[float]) -> float:

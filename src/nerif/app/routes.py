@@ -9,6 +9,8 @@ from collections.abc import Awaitable, Callable, Mapping
 from pathlib import Path
 from urllib.parse import quote, urlencode
 
+import numpy as np
+from jaxtyping import Float
 from starlette.requests import Request
 from starlette.responses import FileResponse, PlainTextResponse, Response
 
@@ -18,10 +20,10 @@ from nerif.common.conventions import InputError
 from nerif.common.files import ending
 from nerif.data.volume import Volume
 from nerif.report.isosurface import default_level, stl_of, surface_triangles
-from nerif.results.directory import REPORT
+from nerif.results.directory import REPORT, ResultDirectory
 from nerif.results.live import read_look
 
-__all__ = ["live_address", "report_address", "report_file", "routes", "surface_address"]
+__all__ = ["bodies_address", "live_address", "report_address", "report_file", "routes", "surface_address"]
 
 SANDBOX = (
     "sandbox allow-scripts allow-downloads; default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
@@ -47,6 +49,11 @@ def surface_address(name: str, quantity: str, level: float, frame: int, stamp: i
     """Return the address of an isosurface."""
     query = {"of": name, "quantity": quantity, "level": repr(level), "frame": frame, "stamp": stamp}
     return "/surface?" + urlencode(query, quote_via=quote)
+
+
+def bodies_address(name: str, stamp: int) -> str:
+    """Return the address of the surface of the bodies in the flow of a result."""
+    return "/bodies?" + urlencode({"of": name, "stamp": stamp}, quote_via=quote)
 
 
 def live_address(name: str, stamp: int) -> str:
@@ -76,11 +83,19 @@ def _live_surface(work: Workspace, query: Mapping[str, str]) -> Response:
 
 
 def _stl_response(volume: Volume, level: float) -> Response:
-    stl = stl_of(surface_triangles(volume, level))
-    return Response(stl, media_type="model/stl", headers={"cache-control": CACHE})
+    return _stl(surface_triangles(volume, level))
 
 
-RESPONSES = {"/report": _report, "/surface": _surface, "/live-surface": _live_surface}
+def _bodies(work: Workspace, query: Mapping[str, str]) -> Response:
+    bodies = ResultDirectory(work.project.path(query.get("of", ""))).bodies()
+    return _stl(np.concatenate([body.corners.numpy() for body in bodies] or [np.zeros((0, 3, 3))]))
+
+
+def _stl(triangles: Float[np.ndarray, "n 3 3"]) -> Response:
+    return Response(stl_of(triangles), media_type="model/stl", headers={"cache-control": CACHE})
+
+
+RESPONSES = {"/report": _report, "/surface": _surface, "/live-surface": _live_surface, "/bodies": _bodies}
 
 
 def routes(work: Workspace) -> dict[str, Handler]:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from nicegui import ui
 
-from nerif.app.routes import live_address, surface_address
+from nerif.app.routes import bodies_address, live_address, surface_address
 from nerif.app.sliders import RangeSlider
 from nerif.common.conventions import unit_shown
 from nerif.data.volume import describe, name_of
@@ -24,6 +24,7 @@ SIZE = 4.0  # longest edge of the box, in scene units
 LIVE_SIZE = (1080, 380)
 GROUND = "#eef1f4"
 EDGE = "#76838f"
+BODY = "#8b949e"
 STEPS = 100  # of the slider
 COLOURS = (("#4aa3dd", 1.0), ("#e8853a", 0.55))  # and opacity
 
@@ -97,12 +98,14 @@ class Surface:
     title : its name for display
     frame : frame of a film
     stamp : value that changes with the file
+    bodies : whether there are bodies in its flow
     """
 
     name: str
     title: str
     frame: int
     stamp: int
+    bodies: bool = False
 
 
 class SurfaceView:
@@ -151,6 +154,9 @@ class SurfaceView:
         for surface, (colour, opacity) in zip(self.surfaces, COLOURS, strict=False):
             address = surface_address(surface.name, self.quantity, self.level, surface.frame, surface.stamp)
             self.scene.add(address, colour, opacity)
+        for surface in self.surfaces[:1]:
+            if surface.bodies:
+                self.scene.add(bodies_address(surface.name, surface.stamp), BODY)
         names = "".join(
             f"<li><i style='background:{colour};opacity:{opacity}'></i>{escape(surface.title)}</li>"
             for surface, (colour, opacity) in zip(self.surfaces, COLOURS, strict=False)

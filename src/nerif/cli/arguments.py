@@ -28,6 +28,7 @@ INPUTS = {
     "calibrate": "no such file or folder; expected images of a target, a calibration file or a measurement",
     "displacement": "no such folder; expected one with a folder for each view",
     "mask": MEASUREMENT,
+    "body": MEASUREMENT,
     "check": "no such file or store; expected a measurement (.nc), or one over time (.zarr)",
     "reconstruct": MEASUREMENT,
     "project": RESULT,
@@ -43,7 +44,7 @@ INPUTS = {
 """Commands whose first word is a file or folder to read, with the error where it does not exist."""
 MAKES_INPUT = {"app": "--demo"}
 """Commands with an option that makes the file or folder of their first word."""
-OUTPUTS = ("design", "pattern", "mask", "check", "simulate", "project", "movie", "export")
+OUTPUTS = ("design", "pattern", "mask", "body", "check", "simulate", "project", "movie", "export")
 """Commands that write a file (--out), and overwrite none without --force."""
 OPTIONS = Path(__file__).with_name("options.json")
 ALIASES = {"from": "source", "drawn": "drawings"}

@@ -17,6 +17,7 @@ COMMANDS = {
     "calibrate": "calibrate cameras from images of a target, import a calibration, or draw the rig",
     "displacement": "compute a measurement from the images of all views",
     "mask": "add flow masks to a measurement, by threshold or from drawings",
+    "body": "add opaque bodies to a measurement, from STL, OBJ or PLY",
     "check": "detect swapped, flipped, mirrored and exchanged views, or pose errors, in a measurement",
     "render": "render the images of an experiment, with the true field",
     "simulate": "simulate a measurement of a phantom by ray tracing, with the true field",

@@ -1,11 +1,12 @@
-"""Aliases of arrays with their shapes, as used in annotations."""
+"""Aliases of arrays with their shapes, as used in annotations; arrays with gaps."""
 
 from __future__ import annotations
 
+import numpy as np
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-__all__ = ["Mask", "Matrix3", "Pixels", "Points", "Values", "Vectors"]
+__all__ = ["Mask", "Matrix3", "Pixels", "Points", "Values", "Vectors", "filled"]
 
 Points = Float[Tensor, "*batch 3"]  # mm, world frame
 Vectors = Float[Tensor, "*batch 3"]  # direction (1) or gradient (1/mm)
@@ -13,3 +14,14 @@ Values = Float[Tensor, "*batch"]  # index excess n - n_ambient (1)
 Pixels = Float[Tensor, "*batch 2"]  # px, (column u, row v), (0, 0) the centre of the top-left pixel
 Matrix3 = Float[Tensor, "3 3"]
 Mask = Bool[Tensor, "*batch"]
+
+
+def filled(values: Float[np.ndarray, "z y x"]) -> Float[np.ndarray, "z y x"]:
+    """Return the values with masked voxels (NaN) set to their nearest neighbour, so that masks have no surface."""
+    from scipy.ndimage import distance_transform_edt
+
+    masked = ~np.isfinite(values)
+    if masked.all() or not masked.any():
+        return np.nan_to_num(values)
+    nearest = distance_transform_edt(masked, return_distances=False, return_indices=True)
+    return values[tuple(nearest)]

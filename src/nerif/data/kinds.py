@@ -25,8 +25,8 @@ __all__ = [
     "known_conventions", "reading_as",
 ]  # fmt: skip
 
-BOST = ("BOST-1.0", "BOST-1.1")
-"""Attribute Conventions of measurements: with the content of version 1.0, and with more."""
+BOST = ("BOST-1.0", "BOST-1.1", "BOST-1.2")
+"""Attribute Conventions of measurements: with the content of version 1.0, with more, and with bodies."""
 RUN, FIELD = "run.toml", "field.safetensors"
 """Settings and field of a result directory."""
 SEQUENCE_KIND = "nerif sequence 1"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -21,13 +21,16 @@ from nerif.data.kinds import MEASUREMENT, reading_as
 from nerif.forward.base import ForwardModel
 from nerif.forward.registry import TECHNIQUES, forward_model
 from nerif.geometry import Box, Camera, Rays
+from nerif.geometry.body import Body
 from nerif.geometry.plausibility import background_cuts, likely_cause, rays_on_lattice
 
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["Measurement", "Observation", "integrals_of", "measurement_of"]
+__all__ = ["MASKS", "Measurement", "Observation", "integrals_of", "measurement_of"]
 
+MASKS = ("valid", "flow_mask", "hidden")
+"""Fields of a measurement that are masks (view, row, column)."""
 WAVELENGTHS_NM = (100.0, 30000.0)  # ultraviolet to thermal infrared
 PIXELS_AT_A_TIME = 1 << 17  # whose rays are traced together
 
@@ -152,6 +155,8 @@ class Measurement:
     maps : (view, row, column) or (view, row, column, c) of other techniques, by their names in the file, such as
         absorbance and absorbance_sigma; NaN: no data
     frame_offsets : by the names of views: instant i is frame i + offset of the view's film; 0 if not named
+    bodies : opaque bodies in the flow
+    hidden : (view, row, column) True for pixels that see a body and have no data, or None
 
     Raises
     ------
@@ -171,6 +176,8 @@ class Measurement:
     ambient_faces: tuple[str, ...] = DEFAULT_AMBIENT_FACES
     maps: Mapping[str, Float[Tensor, "view row column *c"]] = field(default_factory=dict)
     frame_offsets: Mapping[str, int] = field(default_factory=dict)
+    bodies: tuple[Body, ...] = ()
+    hidden: Bool[Tensor, "view row column"] | None = None
 
     def __post_init__(self) -> None:
         self._check_maps()
@@ -195,11 +202,11 @@ class Measurement:
             raise InputError(f"expected one of {', '.join(kinds)}, got none", field="measurement")
         if not self.cameras:
             raise InputError(f"expected one map per camera, got {len(maps[first])} and no camera", field=first)
-        channels = {"valid": 1, "flow_mask": 1}
+        channels = dict.fromkeys(MASKS, 1)
         for kind in kinds.values():
             channels |= {kind.measured: len(kind.channels), kind.sigma: len(kind.channels)}
             channels |= {name: count for name, (count, _) in kind.beside.items()}
-        every = {**maps, "valid": self.valid, "flow_mask": self.flow_mask}
+        every = {**maps, **{name: getattr(self, name) for name in MASKS}}
         for name in every:
             if name not in channels:
                 raise InputError(f"expected names out of {', '.join(sorted(channels))}, got '{name}'", field="maps")
@@ -371,6 +378,8 @@ class Measurement:
     @property
     def _unmasked(self) -> Bool[Tensor, "view row column"]:
         mask = self._inside
+        if self.hidden is not None:
+            mask.logical_and_(~self.hidden)
         return mask if self.valid is None else mask.logical_and_(self.valid)
 
     def _with_data(self, view: int) -> Bool[Tensor, "row column"]:
@@ -450,18 +459,14 @@ class Measurement:
         if len(index) == len(self.cameras):
             return self
 
-        def pick(x: Tensor | None) -> Tensor | None:
-            return None if x is None else x[index]
+        return replace(self, cameras=self._cameras_of(index), **self.mapped(lambda x: x[index]))
 
-        return replace(
-            self,
-            cameras=self._cameras_of(index),
-            displacement=pick(self.displacement),
-            sigma=pick(self.sigma),
-            maps={name: value[index] for name, value in self.maps.items()},
-            valid=pick(self.valid),
-            flow_mask=pick(self.flow_mask),
-        )
+    def mapped(self, change: Callable[[Tensor], Tensor]) -> dict[str, Any]:
+        """Return all maps and masks, changed, as arguments of Measurement."""
+        names = ("displacement", "sigma", *MASKS)
+        present = {name: getattr(self, name) for name in names}
+        changed: dict[str, Any] = {name: None if x is None else change(x) for name, x in present.items()}
+        return changed | {"maps": {name: change(value) for name, value in self.maps.items()}}
 
     def _views(self, names: str | Sequence[str], field: str) -> tuple[str, ...]:
         """Return names of views, or a single one, if they exist."""

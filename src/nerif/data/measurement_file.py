@@ -1,4 +1,4 @@
-"""The file of a measurement: NetCDF-4, Conventions BOST-1.1 or 1.0 (docs/formats.md).
+"""The file of a measurement: NetCDF-4, Conventions BOST-1.0 to 1.2 (docs/formats.md).
 
 Each map of a technique is a variable on view, row, column (and component); the others describe the rig.
 """
@@ -15,11 +15,12 @@ from torch import Tensor
 from nerif.common.conventions import COMPONENTS, DEFAULT_AMBIENT_FACES, InputError, parse_faces, whole
 from nerif.common.netcdf import reading, values
 from nerif.data.kinds import BOST, known_conventions
-from nerif.data.measurement import Measurement
+from nerif.data.measurement import MASKS, Measurement
 from nerif.forward.base import ForwardModel
 from nerif.forward.deflection import Deflection
 from nerif.forward.registry import TECHNIQUES, technique
 from nerif.geometry import PERSPECTIVE, Box, Camera, Lens, Plane, Projection, projection_named
+from nerif.geometry.body import Body
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -28,12 +29,13 @@ __all__ = [
     "CONVENTIONS", "PLAIN", "encoding", "from_dataset", "map_names", "to_dataset", "variables",
 ]  # fmt: skip
 
-PLAIN, CONVENTIONS = BOST
+PLAIN, CONVENTIONS, WITH_BODIES = BOST
 
 PIXELS = ("view", "row", "column")
 RIG = {
     "valid": (PIXELS, "1"),
     "flow_mask": (PIXELS, "1"),
+    "hidden": (PIXELS, "1"),
     "intrinsics": (("view", "i", "j"), "px"),
     "distortion": (("view", "coefficient"), "1"),
     "tilt": (("view", "axis"), "rad"),
@@ -48,12 +50,14 @@ RIG = {
     "window": (("view",), "px"),
     "pose_sigma": (("view", "parameter"), "rad rad rad mm mm mm"),
     "frame_offset": (("view",), "1"),
+    "body_vertices": (("body_vertex", "i"), "mm"),
+    "body_faces": (("body_face", "body_corner"), "1"),
+    "body_of_face": (("body_face",), "1"),
 }
-"""Dimensions and units of masks and of the variables of the rig."""
-MASKS = ("valid", "flow_mask")
+"""Dimensions and units of masks, of the variables of the rig, and of bodies."""
 REQUIRED = ("intrinsics", "rotation", "translation", "box")
 BACKGROUND = ("background_normal", "background_offset")
-SIZES = {"i": 3, "j": 3, "coefficient": 5, "axis": 2, "corner": 2, "side": 2, "parameter": 6}
+SIZES = {"i": 3, "j": 3, "coefficient": 5, "axis": 2, "corner": 2, "side": 2, "parameter": 6, "body_corner": 3}
 SPELLINGS = {"px/mm": "px mm-1"}
 MAX_PIXELS = 1 << 32  # of all views; a damaged file may claim any number
 
@@ -126,6 +130,7 @@ def to_dataset(measurement: Measurement) -> xr.Dataset:
     frame_offsets = np.array([measurement.frame_offsets.get(name, 0) for name in measurement.names], dtype=np.int32)
     if frame_offsets.any():
         data["frame_offset"] = frame_offsets
+    data |= _meshes(measurement.bodies)
     for name, value in {**measurement.all_maps, **{name: getattr(measurement, name) for name in MASKS}}.items():
         if value is not None:
             data[name] = (value.view(torch.int8) if value.dtype == torch.bool else value.float()).numpy()
@@ -140,12 +145,16 @@ def to_dataset(measurement: Measurement) -> xr.Dataset:
     pinholes = all(c.projection == PERSPECTIVE for c in cameras)
     more = data.keys() & {"pose_sigma", "tilt", "frame_offset"}
     plain = names == [Deflection.name] and pinholes and not lenses and not more
+    with_bodies = bool(data.keys() & {"hidden", "body_vertices"})
+    plain &= not with_bodies
     dataset.attrs = {
-        "Conventions": PLAIN if plain else CONVENTIONS,
+        "Conventions": PLAIN if plain else WITH_BODIES if with_bodies else CONVENTIONS,
         **({} if plain else {"technique": " ".join(names)}),
         "n_ambient": measurement.n_ambient,
         "ambient_faces": " ".join(measurement.ambient_faces),
     }
+    if measurement.bodies:
+        dataset["body_name"] = (("body",), np.array([body.name for body in measurement.bodies], dtype=object))
     if not pinholes:
         dataset["projection"] = (("view",), np.array([c.projection.name for c in cameras], dtype=object))
     if measurement.wavelength_nm is not None:
@@ -158,7 +167,7 @@ def from_dataset(dataset: xr.Dataset) -> dict[str, Any]:
     conventions = dataset.attrs.get("Conventions")
     if not known_conventions(conventions):
         raise InputError(
-            f"expected '{PLAIN}' or '{CONVENTIONS}', got '{conventions}'; is it a measurement?",
+            f"expected {' or '.join(map(repr, BOST))}, got '{conventions}'; is it a measurement?",
             field="attribute Conventions",
         )
     _check_variables(dataset)
@@ -182,7 +191,42 @@ def from_dataset(dataset: xr.Dataset) -> dict[str, Any]:
         "wavelength_nm": _number(dataset, "wavelength_nm", "nm") if "wavelength_nm" in dataset.attrs else None,
         "ambient_faces": parse_faces(faces, "attribute ambient_faces"),
         "frame_offsets": _frame_offsets(dataset),
+        "bodies": _bodies(dataset),
     }
+
+
+def _meshes(bodies: tuple[Body, ...]) -> dict[str, np.ndarray]:
+    """Return the variables of bodies, their meshes one after the other; none without bodies."""
+    if not bodies:
+        return {}
+    firsts = np.cumsum([0, *(len(body.vertices) for body in bodies)])
+    faces = [body.faces.numpy() + first for body, first in zip(bodies, firsts[:-1], strict=True)]
+    return {
+        "body_vertices": np.concatenate([body.vertices.numpy() for body in bodies]),
+        "body_faces": np.concatenate(faces).astype(np.int32),
+        "body_of_face": np.repeat(np.arange(len(bodies), dtype=np.int32), [len(f) for f in faces]),
+    }
+
+
+def _bodies(dataset: xr.Dataset) -> tuple[Body, ...]:
+    """Return the bodies of the variables of a file."""
+    if "body_vertices" not in dataset or "body_faces" not in dataset:
+        return ()
+    vertices, faces = _array(dataset, "body_vertices"), _array(dataset, "body_faces").long()
+    number = _optional(dataset, "body_of_face", (len(faces),), 0.0).long()
+    count = int(number.max()) + 1
+    names = _texts(dataset["body_name"]) if "body_name" in dataset else []
+    bodies = []
+    for i in range(count):
+        used, index = faces[number == i].unique(return_inverse=True)
+        name = names[i] if i < len(names) else f"body {i}"
+        if not len(used) or int(used.min()) < 0 or int(used.max()) >= len(vertices):
+            raise InputError(
+                f"expected for {name} triangles of vertices 0 to {len(vertices) - 1}, got others",
+                field="variable 'body_faces'",
+            )
+        bodies.append(Body(vertices[used], index, name))
+    return tuple(bodies)
 
 
 def _frame_offsets(dataset: xr.Dataset) -> dict[str, int]:

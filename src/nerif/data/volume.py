@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerif.common.axis_order import order_remedy
@@ -94,6 +94,11 @@ class Volume:
         """Return a volume with the unit of its quantity and, of an index, the ambient index."""
         attributes: dict[str, float | str] = {"n_ambient": n_ambient} if quantity in INDEX_QUANTITIES else {}
         return cls(values, grid, quantity, describe(quantity)[0], attributes)
+
+    def masked(self, mask: Bool[Tensor, "z y x"], where: str) -> Volume:
+        """Return the volume with NaN in a mask; `where` names the place in its notes."""
+        notes = {**self.notes, "masked_voxels": int(mask.sum()), "masked_where": where}
+        return replace(self, values=self.values.masked_fill(mask, float("nan")), notes=notes)
 
     @property
     def n_ambient(self) -> float | None:

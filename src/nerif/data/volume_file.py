@@ -84,11 +84,11 @@ def _cf(quantity: str, volumes: list[Volume]) -> dict[str, str]:
     return {"ancillary_variables": " ".join(statistics)} if statistics else {}
 
 
-def read_volume(path: str | os.PathLike[str], quantity: str | None = None) -> Volume:
+def read_volume(path: str | os.PathLike[str], quantity: str | None = None, gaps: bool = False) -> Volume:
     """Read one quantity of a .nc or .vti file.
 
     By default index_excess, else n, another reconstructed field, or the only variable. n becomes the index excess where
-    the file has n_ambient, else it stays n in double precision.
+    the file has n_ambient, else it stays n in double precision. With `gaps` an index may be NaN, as within a body.
     """
     arrays, grid, attributes = _read(Path(path))
     if quantity is None:
@@ -101,9 +101,11 @@ def read_volume(path: str | os.PathLike[str], quantity: str | None = None) -> Vo
         )
     volume = _volume(quantity, arrays[quantity], grid, attributes)
     index = quantity in ("index_excess", "n")
-    if (index or "masked_voxels" not in volume.notes) and not bool(torch.isfinite(volume.values).all()):
+    allowed = gaps or (not index and "masked_voxels" in volume.notes)
+    finite = torch.isfinite(volume.values)
+    if not bool(finite.any() if allowed else finite.all()):
         raise InputError(f"variable '{quantity}': expected finite values, got NaN or infinity; fill them", field=path)
-    if index and not bool((volume.values.abs() <= LARGEST_INDEX).all()):
+    if index and not bool((volume.values[finite].abs() <= LARGEST_INDEX).all()):
         raise InputError(
             f"variable '{quantity}': expected refractive indices, got values beyond {LARGEST_INDEX}", field=path
         )

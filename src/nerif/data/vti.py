@@ -1,4 +1,4 @@
-"""VTK image data files (.vti): what ParaView opens."""
+"""VTK XML files, what ParaView opens: images (.vti) of volumes, and polygons (.vtp) of surfaces."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from nerif.common.conventions import InputError
 from nerif.common.files import atomic
 from nerif.geometry import Box, Grid
 
-__all__ = ["read_vti", "write_vti"]
+__all__ = ["read_vti", "write_vti", "write_vtp"]
 
 BLOCK_BYTES = 1 << 20
 ZLIB_LEVEL = 5  # as in VTK
@@ -31,38 +31,82 @@ def write_vti(
     """
     nz, ny, nx = grid.shape
     extent = f"0 {nx - 1} 0 {ny - 1} 0 {nz - 1}"
-    root = ElementTree.Element(
-        "VTKFile", type="ImageData", version="1.0", byte_order="LittleEndian", header_type="UInt64",
-        compressor="vtkZLibDataCompressor",
-    )  # fmt: skip
     corner = [grid.axis(a)[0] for a in "xyz"]
     origin, spacing = (" ".join(repr(float(x)) for x in numbers) for numbers in (corner, grid.spacing))
-    image = ElementTree.SubElement(root, "ImageData", WholeExtent=extent, Origin=origin, Spacing=spacing)
-    appended: list[bytes] = []
+    document = _Document("ImageData", attributes, WholeExtent=extent, Origin=origin, Spacing=spacing)
+    piece = ElementTree.SubElement(document.content, "Piece", Extent=extent)
+    document.add_arrays(piece, "PointData", arrays)
+    document.write(path)
 
-    def add(parent: ElementTree.Element, tag: str, kind: str, name: str, content: bytes, **more: str) -> None:
-        offset = str(sum(map(len, appended)))
+
+def write_vtp(
+    path: str | os.PathLike[str], vertices: Tensor, faces: Tensor, arrays: dict[str, Tensor],
+    attributes: dict[str, float | str],
+) -> None:  # fmt: skip
+    """Write triangles with arrays of their vertices as VTK polygons, lengths in mm, atomically.
+
+    Source: VTK XML file formats, docs.vtk.org (PolyData).
+
+    Parameters
+    ----------
+    vertices : (n, 3) mm
+    faces : (m, 3) vertices of each triangle
+    arrays : (n,) by name
+    """
+    document = _Document("PolyData", attributes)
+    counts = {"NumberOfPoints": str(len(vertices)), "NumberOfPolys": str(len(faces))}
+    piece = ElementTree.SubElement(document.content, "Piece", counts)
+    document.add_arrays(piece, "PointData", arrays)
+    points = ElementTree.SubElement(piece, "Points")
+    document.add(points, "DataArray", "Float64", "Points", _bytes(vertices, "<f8"), NumberOfComponents="3")
+    polygons = ElementTree.SubElement(piece, "Polys")
+    document.add(polygons, "DataArray", "Int64", "connectivity", _bytes(faces, "<i8"))
+    document.add(polygons, "DataArray", "Int64", "offsets", np.arange(3, 3 * len(faces) + 1, 3).astype("<i8").tobytes())
+    document.write(path)
+
+
+def _bytes(values: Tensor, kind: str) -> bytes:
+    return values.cpu().contiguous().numpy().astype(kind).tobytes()
+
+
+class _Document:
+    """A VTK XML file under construction: its element of a kind such as ImageData, and the data appended to it."""
+
+    def __init__(self, kind: str, attributes: dict[str, float | str], **extent: str) -> None:
+        self.root = ElementTree.Element(
+            "VTKFile", type=kind, version="1.0", byte_order="LittleEndian", header_type="UInt64",
+            compressor="vtkZLibDataCompressor",
+        )  # fmt: skip
+        self.content = ElementTree.SubElement(self.root, kind, extent)
+        self.appended: list[bytes] = []
+        about = ElementTree.SubElement(self.content, "FieldData")
+        for name, value in attributes.items():
+            if isinstance(value, str):
+                self.add(about, "Array", "String", name, value.encode() + b"\0", NumberOfTuples="1")
+            else:
+                self.add(about, "DataArray", "Float64", name, np.array(value, "<f8").tobytes(), NumberOfTuples="1")
+
+    def add(self, parent: ElementTree.Element, tag: str, kind: str, name: str, content: bytes, **more: str) -> None:
+        """Add an array of a type such as Float64."""
+        offset = str(sum(map(len, self.appended)))
         ElementTree.SubElement(
             parent, tag, {"type": kind, "Name": name, **more, "format": "appended", "offset": offset}
         )
-        appended.append(_compress(content))
+        self.appended.append(_compress(content))
 
-    about = ElementTree.SubElement(image, "FieldData")
-    for name, value in attributes.items():
-        if isinstance(value, str):
-            add(about, "Array", "String", name, value.encode() + b"\0", NumberOfTuples="1")
-        else:
-            add(about, "DataArray", "Float64", name, np.array(value, "<f8").tobytes(), NumberOfTuples="1")
-    piece = ElementTree.SubElement(image, "Piece", Extent=extent)
-    points = ElementTree.SubElement(piece, "PointData", Scalars=next(iter(arrays)))
-    for quantity, values in arrays.items():
-        numbers = values.cpu().contiguous().numpy()
-        kind = {"f4": "Float32", "f8": "Float64"}[numbers.dtype.str[1:]]
-        add(points, "DataArray", kind, quantity, numbers.astype(f"<{numbers.dtype.str[1:]}").tobytes())
-    ElementTree.SubElement(root, "AppendedData", encoding="raw").text = "_"
-    before, after = ElementTree.tostring(root).split(b"_</AppendedData>")
-    with atomic(path) as part, part.open("wb") as file:
-        file.writelines([before + b"_", *appended, b"</AppendedData>" + after])
+    def add_arrays(self, piece: ElementTree.Element, tag: str, arrays: dict[str, Tensor]) -> None:
+        """Add an element with arrays of points, the first of which is shown."""
+        points = ElementTree.SubElement(piece, tag, Scalars=next(iter(arrays)))
+        for name, values in arrays.items():
+            size = values.element_size()
+            self.add(points, "DataArray", {4: "Float32", 8: "Float64"}[size], name, _bytes(values, f"<f{size}"))
+
+    def write(self, path: str | os.PathLike[str]) -> None:
+        """Write the file atomically."""
+        ElementTree.SubElement(self.root, "AppendedData", encoding="raw").text = "_"
+        before, after = ElementTree.tostring(self.root).split(b"_</AppendedData>")
+        with atomic(path) as part, part.open("wb") as file:
+            file.writelines([before + b"_", *self.appended, b"</AppendedData>" + after])
 
 
 def _compress(content: bytes) -> bytes:

@@ -139,7 +139,9 @@ def derive(excess: Volume, quantity: str, gas: GasSettings) -> Volume:
         where = f"n - 1 <= 0, or temperature beyond {low:g} to {high:g} K"
         if gas.for_field(excess).uniform_pressure == "no":
             values, where = torch.full_like(values, math.nan), NOT_UNIFORM
-    count = int(torch.isnan(values).sum())
+    count, earlier = int(torch.isnan(values).sum()), int(excess.notes.get("masked_voxels", 0))
+    if earlier:
+        where = f"{excess.notes['masked_where']}, or {where}" if count > earlier else str(excess.notes["masked_where"])
     notes: dict[str, float | str] = {"assumption": assumption, "masked_voxels": count, "masked_where": where}
     return Volume(values.float(), excess.grid, quantity, QUANTITIES[quantity][0], attributes, notes)
 

@@ -9,7 +9,7 @@ import dataclasses
 import inspect
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -19,6 +19,7 @@ from nerif.data.measurement import Measurement
 from nerif.data.volume import Volume, describe, name_of
 from nerif.fields.base import Field
 from nerif.geometry import Box, Grid
+from nerif.geometry.body import Body, contained
 from nerif.geometry.symmetry import Axis
 from nerif.reconstruction.rig.parameters import RefinedView
 
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
     import xarray as xr
     from matplotlib.figure import Figure
 
-__all__ = ["VOXELS", "OnStep", "Outcome", "Reconstruction", "Reconstructor", "State", "Step", "compose"]
+__all__ = ["VOXELS", "OnStep", "Outcome", "Reconstruction", "Reconstructor", "State", "Step", "compose", "sampled"]
 
 VOXELS = 100  # of a volume along the longest edge
 NOTEBOOK_VOXELS = 48  # along the longest edge
@@ -119,6 +120,7 @@ class Reconstruction:
     state : to resume from, or None
     rig : corrections of each view (refinement.py)
     axis : of a symmetric flow, as estimated (symmetry.py); None without symmetry
+    bodies : in the flow; within them the field has no meaning, and volumes are NaN
     """
 
     field: Field
@@ -134,6 +136,7 @@ class Reconstruction:
     quantity: str = "index_excess"
     rig: list[RefinedView] = dataclasses.field(default_factory=list)
     axis: Axis | None = None
+    bodies: tuple[Body, ...] = ()
 
     @property
     def model(self) -> str:
@@ -141,9 +144,12 @@ class Reconstruction:
         return str(self.settings["model"])
 
     def volume(self, grid: Grid | int = VOXELS) -> Volume:
-        """Return the field at the voxel centres of a grid, or of one with that many along the longest edge."""
+        """Return the field at the voxel centres of a grid, or of one with that many along the longest edge.
+
+        Voxels whose centre is within a body are NaN.
+        """
         grid = grid if isinstance(grid, Grid) else Grid.of_resolution(self.box, grid)
-        return Volume.of(self.field.sample(grid, self.device), grid, self.quantity, self.n_ambient)
+        return sampled(self.field, grid, self.quantity, self.n_ambient, self.bodies, self.device)
 
     def to_xarray(self, grid: Grid | int = VOXELS) -> xr.DataArray:
         """Return the volume on a grid with coordinates x, y, z in mm, unit and attributes."""
@@ -174,6 +180,14 @@ class Reconstruction:
         image = show_slices(volume)
         caption = f"{describe(self.quantity)[1].capitalize()} in the three middle slices"
         return panel("Reconstruction", rows + misfits[:1] + volume.summary(), (image, caption))
+
+
+def sampled(
+    field: Field, grid: Grid, quantity: str, n_ambient: float, bodies: Sequence[Body] = (), device: str = "cpu"
+) -> Volume:
+    """Return a field at the voxel centres of a grid, NaN within bodies."""
+    volume = Volume.of(field.sample(grid, device), grid, quantity, n_ambient)
+    return volume.masked(contained(bodies, grid.points()), "within a body") if bodies else volume
 
 
 class Reconstructor(ABC):

@@ -6,7 +6,7 @@ import errno
 import hashlib
 import json
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -27,16 +27,28 @@ from nerif.fields.sum import SumField
 from nerif.fields.symmetric import SymmetricNetwork, SymmetricVoxels
 from nerif.forward.registry import forward_model
 from nerif.geometry import Box, Camera, Grid
+from nerif.geometry.body import Body
 from nerif.geometry.symmetry import Symmetry
 from nerif.reconstruction.base import OnStep, Reconstruction, State, Step
 
 __all__ = [
-    "CHECKPOINT", "FIELD", "check_fingerprint", "checkpoints", "digest", "fingerprint", "read_field", "read_quantity",
-    "read_state", "write_field", "write_state",
+    "CHECKPOINT",
+    "FIELD",
+    "check_fingerprint",
+    "checkpoints",
+    "digest",
+    "fingerprint",
+    "read_bodies",
+    "read_field",
+    "read_quantity",
+    "read_state",
+    "write_field",
+    "write_state",
 ]  # fmt: skip
 
 CHECKPOINT = "checkpoint.safetensors"
-VERSION = 1  # of the field file
+VERSION, WITH_BODIES = 1, 2  # of the field file
+BODIES = "bodies."  # beginning of the names of their tensors
 
 
 def fingerprint(measurement: Measurement, open_faces: tuple[str, ...] = ()) -> dict[str, str]:
@@ -55,6 +67,7 @@ def fingerprint(measurement: Measurement, open_faces: tuple[str, ...] = ()) -> d
         **maps,
         "valid pixels": digest([measurement.usable]),
         "flow_mask": digest([measurement.flow_mask]),
+        **({"bodies": digest(_meshes(measurement.bodies).values())} if measurement.bodies else {}),
         "box": digest([measurement.box.lower, measurement.box.upper]),
         "n_ambient": digest([measurement.n_ambient]),
         **{name: digest(values) for name, values in constants.items()},
@@ -103,10 +116,31 @@ def digest(parts: Iterable[Any]) -> str:
 
 def write_field(directory: Path, result: Reconstruction) -> None:
     """Write a field atomically, with everything needed to evaluate it."""
-    about = {"version": VERSION, "n_ambient": result.n_ambient, "outcome": vars(result.outcome)}
+    version = WITH_BODIES if result.bodies else VERSION
+    about = {"version": version, "n_ambient": result.n_ambient, "outcome": vars(result.outcome)}
     about |= {"quantity": result.quantity}
+    if result.bodies:
+        about["bodies"] = [body.name for body in result.bodies]
     tensors, entries = _entries_of(result.field)
+    tensors |= _meshes(result.bodies)
     _save(directory / FIELD, tensors, {**about, "box": [result.box.lower, result.box.upper], **entries})
+
+
+def _meshes(bodies: Sequence[Body]) -> dict[str, Tensor]:
+    """The tensors of bodies by their names in a file."""
+    tensors: dict[str, Tensor] = {}
+    for i, body in enumerate(bodies):
+        tensors |= {f"{BODIES}{i}.vertices": body.vertices, f"{BODIES}{i}.faces": body.faces}
+    return tensors
+
+
+def read_bodies(directory: Path) -> tuple[Body, ...]:
+    """Read the bodies in the flow of a result directory."""
+    tensors, about = _load(directory / FIELD)
+    names = about.get("bodies", ())
+    return tuple(
+        Body(tensors[f"{BODIES}{i}.vertices"], tensors[f"{BODIES}{i}.faces"], name) for i, name in enumerate(names)
+    )
 
 
 def _entries_of(field: Field) -> tuple[dict[str, Tensor], dict[str, Any]]:
@@ -142,15 +176,17 @@ def read_field(directory: Path) -> tuple[Field, Box, float]:
         what = "the directory has no" if directory.is_dir() else "no such directory with a"
         raise InputError(f"expected a reconstruction, but {what} {FIELD}; run nerif reconstruct first", field=directory)
     tensors, about = _load(path)
-    if about.get("version", 1) != VERSION:
+    if about.get("version", 1) not in (VERSION, WITH_BODIES):
         raise InputError(
-            f"expected version {VERSION} of fields, got {about['version']}; read it with a later version of nerif",
+            f"expected version {VERSION} or {WITH_BODIES} of fields, got {about['version']}; read it with a later "
+            "version of nerif",
             field=path,
         )
     try:
         lower, upper = about["box"]
         box = Box(tuple(lower), tuple(upper))
-        return _field_of(tensors, about, box), box, float(about["n_ambient"])
+        parts = {name: tensor for name, tensor in tensors.items() if not name.startswith(BODIES)}
+        return _field_of(parts, about, box), box, float(about["n_ambient"])
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         raise InputError(
             f"not a field of this version of nerif ({type(error).__name__}: {error})", field=path

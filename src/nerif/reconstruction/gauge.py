@@ -1,10 +1,11 @@
 """The gauge: regions where the field is ambient, 0, which fix the constant that displacements leave undetermined.
 
-By default the side faces of the box and, with flow masks, the space outside the visual hull.
+By default the side faces of the box and, with flow masks, the space outside the visual hull; never within a body.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -15,8 +16,11 @@ from torch import Tensor
 from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
 from nerif.geometry import Box, Grid
+from nerif.geometry.body import Body, contained
 
 __all__ = ["AmbientRegion", "ambient_faces", "check_gauge", "is_open", "visual_hull"]
+
+FEW = 1024  # points that show whether a region has any outside bodies
 
 
 def is_open(measurement: Measurement) -> bool:
@@ -40,15 +44,25 @@ def check_gauge(measurement: Measurement, faces: tuple[str, ...], hull: bool = T
 
 
 def visual_hull(measurement: Measurement, grid: Grid) -> Bool[Tensor, "z y x"]:
-    """Return the voxels whose centres lie inside the flow mask of every view that has them in its image."""
+    """Return the voxels whose centres lie inside the flow mask of every view that has them in its image.
+
+    A pixel that sees a body says nothing about the flow behind it.
+    """
     if measurement.flow_mask is None:
         raise InputError("expected masks in the measurement for the visual hull, got none", field="flow_mask")
-    inside = _in_hull(measurement, measurement.flow_mask, grid)
+    inside = _in_hull(measurement, _flow(measurement), grid)
     if not bool(inside.any()):
         raise InputError(
             "the masks leave no voxel of the box; are they inverted, or of other views?", field="flow_mask"
         )
     return inside
+
+
+def _flow(measurement: Measurement) -> Bool[Tensor, "view row column"]:
+    """The pixels that may show flow: the masks, and pixels that see a body."""
+    masks, hidden = measurement.flow_mask, measurement.hidden
+    assert masks is not None
+    return masks if hidden is None else masks | hidden
 
 
 def _in_hull(measurement: Measurement, masks: Tensor, grid: Grid) -> Bool[Tensor, "z y x"]:
@@ -82,6 +96,7 @@ class AmbientRegion:
     faces: tuple[str, ...]
     empty: Float[Tensor, "m 3"]  # centres of voxels that are outside the hull with all their corners, mm
     voxel: tuple[float, float, float]  # their edges, mm
+    bodies: Sequence[Body] = ()
 
     @classmethod
     def of(cls, measurement: Measurement, faces: tuple[str, ...], resolution: int = 48) -> AmbientRegion | None:
@@ -90,14 +105,17 @@ class AmbientRegion:
         grid = Grid.of_resolution(measurement.box, resolution)
         empty = torch.zeros(0, 3)
         if measurement.flow_mask is not None:
-            empty = grid.points()[_outside(measurement, measurement.flow_mask, grid)]
+            empty = grid.points()[_outside(measurement, _flow(measurement), grid)]
         check_gauge(measurement, faces, bool(len(empty)))
         if not faces and not len(empty):
             return None
-        return cls(measurement.box, faces, empty, grid.spacing)
+        region = cls(measurement.box, faces, empty, grid.spacing, measurement.bodies)
+        if not len(region.sample(FEW, torch.Generator().manual_seed(0))):
+            raise InputError("expected a region outside the bodies, got none; name other faces", field="ambient_faces")
+        return region
 
     def sample(self, count: int, generator: torch.Generator) -> Float[Tensor, "n 3"]:
-        """Draw about `count` random points (mm), half of them outside the hull if there is one."""
+        """Draw about `count` random points (mm) outside bodies, half of them outside the hull if there is one."""
         points = []
         share = count // 2 if len(self.empty) and self.faces else count
         if self.faces:
@@ -108,7 +126,8 @@ class AmbientRegion:
             index = torch.randint(len(self.empty), (share,), generator=generator)
             shift = (torch.rand(share, 3, generator=generator) - 0.5) * torch.tensor(self.voxel)
             points.append(self.empty[index] + shift)
-        return torch.cat(points)
+        sample = torch.cat(points)
+        return sample[~contained(self.bodies, sample)] if self.bodies else sample
 
     @cached_property
     def _face_frames(self) -> tuple[Float[Tensor, "face 1 3"], Float[Tensor, "face 2 3"]]:

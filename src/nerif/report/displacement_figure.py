@@ -6,6 +6,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from jaxtyping import Bool
+from torch import Tensor
 
 from nerif.common.files import atomic
 from nerif.data.measurement import Measurement
@@ -67,11 +69,10 @@ def save_displacements(path: Path, measurement: Measurement) -> None:
     _save(figure, path, image, grid, "displacement [px]", "both")
 
 
-def save_masks(path: Path, measurement: Measurement) -> None:
-    """Write an image with the magnitude of the first technique in every view, and the outline of the flow mask."""
-    assert measurement.flow_mask is not None
+def save_masks(path: Path, measurement: Measurement, masks_of_views: Bool[Tensor, "view row column"]) -> None:
+    """Write an image with the magnitude of the first technique in every view, and the outlines of masks."""
     step, observation = _step(measurement), measurement.observations[0]
-    maps = measurement.usable_for(observation), observation.values, measurement.flow_mask
+    maps = measurement.usable_for(observation), observation.values, masks_of_views
     usable, components, masks = (x[:, ::step, ::step].numpy() for x in maps)
     d = np.where(usable, np.linalg.norm(components, axis=-1), np.nan)
     limit = float(np.nanpercentile(d, 99.5)) or 1.0

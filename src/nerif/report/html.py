@@ -21,6 +21,7 @@ from nerif.report import figures, summary
 from nerif.report.meridian_figure import draw_centre_line, draw_profiles, draw_section
 from nerif.report.pages import residuals_over_sigma
 from nerif.report.scene import scene_of
+from nerif.report.surface_figure import draw_surface
 from nerif.report.view_images import colour_table, view_images
 from nerif.results.directory import Result
 
@@ -136,6 +137,11 @@ def _curves(result: Result) -> list[tuple[str, str]]:
     def add(title: str, draw: Callable[..., object], *data: Any) -> None:
         curves.append((title, svg(lambda axes: draw(axes, *data))))
 
+    if result.surface is not None:
+        for quantity in result.surface.quantities:
+            title = f"{name_of(quantity).capitalize()} on the surface of the bodies"
+            curves.append((title, image(partial(draw_surface, surface=result.surface, quantity=quantity), 7, 3.6, 10)))
+            break
     if result.history:
         add("Convergence", figures.draw_history, result.history)
     if result.reprojection is not None:

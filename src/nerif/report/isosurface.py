@@ -7,13 +7,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float
 
+from nerif.common.arrays import filled
 from nerif.data.volume import Volume
 from nerif.plotting.drawing import colour_range, plotted_values
 
 if TYPE_CHECKING:
     from mpl_toolkits.mplot3d import Axes3D
 
-__all__ = ["default_level", "draw_isosurface", "filled", "stl_of", "surface_triangles"]
+__all__ = ["default_level", "draw_isosurface", "stl_of", "surface_triangles"]
 
 MAX_VOXELS = 80  # along an edge: finer surfaces look the same in print and take minutes to draw
 FACE = "#E69F00"
@@ -48,17 +49,6 @@ def stl_of(triangles: Float[np.ndarray, "n 3 3"]) -> bytes:
     records = np.zeros(len(triangles), dtype=[("numbers", "<f4", (4, 3)), ("attribute", "<u2")])
     records["numbers"] = np.concatenate([normals[:, None], triangles], axis=1)
     return b"nerif, mm".ljust(80) + np.uint32(len(triangles)).tobytes() + records.tobytes()
-
-
-def filled(values: Float[np.ndarray, "z y x"]) -> Float[np.ndarray, "z y x"]:
-    """Return the values with masked voxels (NaN) set to their nearest neighbour, so that masks have no surface."""
-    from scipy.ndimage import distance_transform_edt
-
-    masked = ~np.isfinite(values)
-    if masked.all() or not masked.any():
-        return np.nan_to_num(values)
-    nearest = distance_transform_edt(masked, return_distances=False, return_indices=True)
-    return values[tuple(nearest)]
 
 
 def draw_isosurface(axes: Axes3D, volume: Volume, level: float) -> Axes3D:

@@ -10,6 +10,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from nerif.common.arrays import filled
 from nerif.common.conventions import InputError
 from nerif.common.files import atomic, ending
 from nerif.common.installation import install
@@ -17,7 +18,7 @@ from nerif.common.settings import check_settings
 from nerif.data.volume import Volume, field_of
 from nerif.data.volume_sequence import VolumeSequence
 from nerif.plotting.drawing import COLOUR_MAPS, LABELS, SEQUENTIAL, colour_range, plotted_values
-from nerif.report.isosurface import default_level, filled
+from nerif.report.isosurface import default_level
 
 __all__ = ["Movie", "finished_frames", "ranges_over_time"]
 

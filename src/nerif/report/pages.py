@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from nerif.common.arrays import filled
 from nerif.common.conventions import with_unit
 from nerif.common.files import atomic
 from nerif.common.written_files import OwnFiles
@@ -31,6 +32,7 @@ from nerif.plotting.drawing import (
 from nerif.report import figures
 from nerif.report.isosurface import default_level, draw_isosurface
 from nerif.report.meridian_figure import draw_centre_line, draw_profiles, draw_section
+from nerif.report.surface_figure import draw_surface
 from nerif.report.view_images import lattice_step
 from nerif.results.directory import Result
 
@@ -84,6 +86,11 @@ def figures_of(result: Result, single: float, double: float) -> Iterator[tuple[s
         yield "comparison", comparison(result.field, error, double)
     for quantity in quantities if result.field is None or min(result.field.grid.shape) > 1 else ():
         yield f"isosurface_{quantity}", isosurface(result.volumes[quantity], single)
+    if result.surface is not None:
+        for quantity in plotted_quantities(result.surface.quantities):
+            figure = _page(double, 0.5)
+            draw_surface(figure, result.surface, quantity)
+            yield f"surface_{quantity}", figure
     if (meridian := result.meridian) is not None:
         plots = ("section", draw_section), ("profiles", draw_profiles), ("centre_line", draw_centre_line)
         for quantity, (name, draw) in itertools.product(plotted_quantities(meridian.quantities), plots):
@@ -239,7 +246,7 @@ def comparison(field: Volume, error: Volume, width: float) -> Figure:
     """Draw middle slices of reconstruction, truth and error."""
     truth = replace(field, values=field.values - error.values)
     limits = colour_range(plotted_values(truth))
-    largest = float(error.values.abs().max()) or 1.0
+    largest = float(error.values.nan_to_num(0.0).abs().max()) or 1.0
     ex, ey, ez = field.grid.box.edges
     figure = _page(width, max(0.3, 2.7 * max(ey, ez) / (2 * ex + ey)) + 0.08)
     grid = figure.subplots(3, 3, gridspec_kw={"width_ratios": [ex, ex, ey]})
@@ -263,6 +270,6 @@ def error_of(result: Result) -> Volume | None:
         return replace(field, values=field.values - truth.values, attributes={})
     if not truth.grid.box.holds(field.grid.box):
         return None
-    spline = VoxelField.through(truth.values, truth.grid)
+    spline = VoxelField.through(torch.from_numpy(filled(truth.values.numpy())), truth.grid)
     with torch.no_grad():
         return replace(field, values=field.values - spline.sample(field.grid), attributes={})

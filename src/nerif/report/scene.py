@@ -31,6 +31,7 @@ from nerif.results.directory import Result
 
 __all__ = ["scene_of", "scene_over_time"]
 
+MAX_TRIANGLES, BODY_CELLS = 20_000, 100  # of a body as it is; of the lattice along its longest edge
 MAX_FRAME_VOXELS = 48  # along the longest edge; the page of a sequence has dozens of volumes
 
 
@@ -65,6 +66,7 @@ def scene_of(result: Result) -> tuple[dict[str, Any] | None, dict[str, str]]:
         **_scene(small.grid, field.grid, entries, variants, (DIVERGING, "cividis")),
         "arrays": {name: {"low": p["low"], "step": p["step"]} for name, p in packed.items()},
         "cameras": _cameras(result),
+        "bodies": _bodies(result),
         "backgrounds": result.measurement is not None and any(c.background for c in result.measurement.cameras),
     }
     return scene, {name: p["text"] for name, p in packed.items()}
@@ -92,6 +94,7 @@ def scene_over_time(store: VolumeSequence, frames: list[int]) -> tuple[dict[str,
         "arrays": {"value": scales[0]},
         "frames": [{"index": i, "time": store.times[i], **s} for i, s in zip(frames, scales, strict=True)],
         "cameras": [],
+        "bodies": [],
     }
     arrays = {"value": packed[0]["text"]}
     return scene, arrays | {f"frame-{k}": p["text"] for k, p in enumerate(packed)}
@@ -125,6 +128,22 @@ def _scene(
         "diverging": DIVERGING if DIVERGING in maps else "",
         "tables": {name: [c for rgb in colour_table(name) for c in rgb] for name in maps},
     }
+
+
+def _bodies(result: Result) -> list[dict[str, Any]]:
+    """The triangles of bodies, mm, with vertices of a lattice where there are many."""
+    bodies = []
+    for body in () if result.measurement is None else result.measurement.bodies:
+        vertices, faces = body.vertices.numpy(), body.faces.numpy()
+        if len(faces) > MAX_TRIANGLES:
+            lower, upper = vertices.min(axis=0), vertices.max(axis=0)
+            cell = float((upper - lower).max()) / BODY_CELLS
+            vertices, index = np.unique(np.round((vertices - lower) / cell) * cell + lower, axis=0, return_inverse=True)
+            faces = index.ravel()[faces]
+            a, b, c = faces.T
+            faces = np.unique(faces[(a != b) & (b != c) & (c != a)], axis=0)
+        bodies.append({"vertices": np.round(vertices, 3).ravel().tolist(), "faces": faces.ravel().tolist()})
+    return bodies
 
 
 def _cameras(result: Result) -> list[dict[str, Any]]:

@@ -21,24 +21,28 @@ from nerif.data.kinds import RESULT, RUN, check_kind
 from nerif.data.measurement import Measurement
 from nerif.data.meridian import Meridian
 from nerif.data.reprojection import Reprojection
+from nerif.data.surface import SurfaceMap
 from nerif.data.volume import INDEX, Volume, field_of
 from nerif.data.volume_file import read_volume, read_volumes
 from nerif.fields.base import Field
-from nerif.geometry import Box
+from nerif.geometry import Box, Grid
+from nerif.geometry.body import Body
 from nerif.geometry.symmetry import Symmetry
 from nerif.reconstruction import files as field_files
-from nerif.reconstruction.base import Reconstruction, State
-from nerif.reconstruction.files import CHECKPOINT, FIELD, read_field, read_quantity, read_state
+from nerif.reconstruction.base import Reconstruction, State, sampled
+from nerif.reconstruction.files import CHECKPOINT, FIELD, read_bodies, read_field, read_quantity, read_state
 from nerif.reconstruction.methods import METHODS
 from nerif.results.metrics import Metrics
 
 __all__ = [
-    "CALIBRATION", "FIGURES", "METRICS", "REPORT", "RUN", "VOLUME", "Gap", "Result", "ResultDirectory", "versions",
+    "CALIBRATION", "FIGURES", "METRICS", "REPORT", "RUN", "SURFACE", "VOLUME", "Gap", "Result", "ResultDirectory",
+    "versions",
 ]  # fmt: skip
 
 METRICS, HISTORY, REPORT = "metrics.json", "history.csv", "report.html"
 VOLUME, VOLUME_VTI, REPROJECTION = "volume.nc", "volume.vti", "reprojection.nc"
 MERIDIAN, LIVE, LIVE_FIELD = ("meridian.nc", "meridian.csv"), "live.json", "live.npz"
+SURFACE = ("surface.nc", "surface.vtp")
 TRIALS, CROSS_VALIDATION, FIGURES, CALIBRATION = "trials", "cross_validation", "figures", "calibration.toml"
 FILES = (RUN, METRICS, HISTORY, FIELD, CHECKPOINT, VOLUME, VOLUME_VTI, REPROJECTION, REPORT, CALIBRATION)
 
@@ -77,6 +81,7 @@ class Result:
     reprojection : measured and predicted views, or None
     measurement : or None
     truth : field it was compared with, an index relative to the ambient of the result, or None
+    surface : quantities on the surface of bodies, or None
     missing : files that are missing or damaged
     """
 
@@ -89,6 +94,7 @@ class Result:
     reprojection: Reprojection | None = None
     measurement: Measurement | None = None
     truth: Volume | None = None
+    surface: SurfaceMap | None = None
     missing: tuple[Gap, ...] = ()
 
     @property
@@ -153,7 +159,7 @@ class ResultDirectory:
 
         A foreign calibration is renamed only when one is written.
         """
-        names = (*FILES, *MERIDIAN, LIVE, LIVE_FIELD)
+        names = (*FILES, *MERIDIAN, *SURFACE, LIVE, LIVE_FIELD)
         self.files.remove(names)
         self.files.set_aside([name for name in names if name != CALIBRATION])
         if self.has(CALIBRATION):
@@ -209,6 +215,12 @@ class ResultDirectory:
             with self.writing(name) as path:
                 write(path)
 
+    def write_surface(self, surface: SurfaceMap) -> None:
+        """Write surface.nc and surface.vtp."""
+        for name in SURFACE:
+            with self.writing(name) as path:
+                surface.write(path)
+
     def write_reprojection(self, reprojection: Reprojection) -> None:
         """Write measured and predicted views."""
         with self.writing(REPROJECTION) as path:
@@ -219,6 +231,15 @@ class ResultDirectory:
     def field(self) -> tuple[Field, Box, float]:
         """Return the field, its box (mm) and n_ambient."""
         return read_field(self.path)
+
+    def bodies(self) -> tuple[Body, ...]:
+        """Return the bodies in the flow."""
+        return read_bodies(self.path)
+
+    def sample(self, grid: Grid) -> Volume:
+        """Return the field at the voxel centres of a grid, NaN within bodies."""
+        field, _, n_ambient = self.field()
+        return sampled(field, grid, self.quantity(), n_ambient, self.bodies())
 
     def quantity(self) -> str:
         """Return the quantity of the field (volume.QUANTITIES)."""
@@ -304,6 +325,7 @@ class ResultDirectory:
         history: list[dict[str, float]] = []
         volumes: dict[str, Volume] = {}
         reprojection, measurement = None, None
+        surface: SurfaceMap | None = None
         if views:
             history = attempt(HISTORY, self.history, history, "no convergence curves")
         if views or metrics.uncertainty:
@@ -313,6 +335,8 @@ class ResultDirectory:
                 REPROJECTION, self.reprojection, None, "no views to show; nerif evaluate --measurement FILE adds them"
             )
             measurement = _measurement(run) if reprojection is None else reprojection.measurement
+            if self.has(SURFACE[0]):
+                surface = attempt(SURFACE[0], lambda: SurfaceMap.read(self / SURFACE[0]), None, "no surface to show")
         if not finished:
             remedy = "Start it again"
             if self.has(CHECKPOINT):
@@ -329,6 +353,7 @@ class ResultDirectory:
             reprojection=reprojection,
             measurement=measurement,
             truth=self._truth(metrics, volumes, gaps) if views else None,
+            surface=surface,
             missing=tuple(gaps),
         )
 
@@ -341,7 +366,7 @@ class ResultDirectory:
         try:
             quantity = field_of(volumes)
             path = next((p for p in places if p.is_file()), places[0])
-            truth = read_volume(path, None if quantity in (None, INDEX) else quantity)
+            truth = read_volume(path, None if quantity in (None, INDEX) else quantity, gaps=True)
             ambient = volumes[INDEX].n_ambient if quantity == INDEX else None
             return truth if ambient is None else truth.relative_to(ambient)
         except InputError as error:

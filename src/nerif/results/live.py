@@ -29,7 +29,7 @@ from nerif.forward.base import ForwardModel
 from nerif.forward.path_integral import PathIntegral, project
 from nerif.forward.registry import AUTO, forward_model
 from nerif.geometry import Box, Grid
-from nerif.reconstruction.base import OnStep, Reconstructor, Step, compose
+from nerif.reconstruction.base import OnStep, Reconstructor, Step, compose, sampled
 from nerif.reconstruction.progress import Monitor
 from nerif.reconstruction.uncertainty.bootstrap import best_covered
 from nerif.results.directory import LIVE, LIVE_FIELD
@@ -166,7 +166,8 @@ class Live:
     def _look(self, title: str, step: Step, withheld: bool) -> None:
         m, field = self.measurement, step.field()
         grid = Grid.of_resolution(m.box, COARSE_VOXELS)
-        arrays: dict[str, np.ndarray] = {"values": field.sample(grid, _device(field)).numpy()}
+        volume = sampled(field, grid, m.quantity, m.n_ambient, m.bodies, str(_device(field)))
+        arrays: dict[str, np.ndarray] = {"values": volume.values.numpy()}
         about: dict[str, Any] = {
             "title": title, "seconds": step.seconds, "quantity": m.quantity, "lower": m.box.lower,
             "upper": m.box.upper, "withheld": withheld, "view": "", "components": (), "unit": "",

@@ -81,7 +81,9 @@ class CheckpointedRun:
     def _read(self) -> Reconstruction:
         settings = dataclasses.asdict(self.reconstructor)  # type: ignore[call-overload]
         outcome = Outcome("converged", "read from disk")
-        return Reconstruction(*self.directory.field(), [], outcome, settings, quantity=self.directory.quantity())
+        field, box, n_ambient = self.directory.field()
+        quantity, bodies = self.directory.quantity(), self.data.bodies
+        return Reconstruction(field, box, n_ambient, [], outcome, settings, quantity=quantity, bodies=bodies)
 
     def _write_inputs(self, resumed: bool) -> OnStep:
         """Return a callback that clears the directory at the first step of a new run and writes its inputs."""

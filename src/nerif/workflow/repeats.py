@@ -40,7 +40,7 @@ def write_deviations(
     out.add_metrics(uncertainty={**entries, "trials": deviations.count})
     for line in masked_lines(volumes):
         monitor.say(line)
-    rms, largest = float(std.values.square().mean().sqrt()), float(volumes[0].values.abs().max())
+    rms, largest = float(std.values.square().nanmean().sqrt()), float(volumes[0].values.nan_to_num(0.0).abs().max())
     size = f"rms standard deviation of {volumes[0].quantity} {rms:.3g}, {rms / largest:.2%} of the maximum"
     samples = {"bootstrap": "trials", "posterior": "draws from the posterior"}[entries["source"]]
     monitor.say(f"uncertainty from {deviations.count} {samples}: {size}")

@@ -16,8 +16,10 @@ from typing import Any, ClassVar
 from nerif.analysis.asymmetry import asymmetry, asymmetry_sentence
 from nerif.analysis.evaluation import evaluate_views, score_lines
 from nerif.analysis.prediction import reproject
+from nerif.analysis.surface import surface_map
 from nerif.analysis.verdict import verdict
-from nerif.data.volume import quantities_of
+from nerif.common.conventions import unit_shown
+from nerif.data.volume import describe, quantities_of
 from nerif.geometry import Grid
 from nerif.imaging.calibration.cameras_file import CalibratedCamera, write_cameras
 from nerif.physics.quantities import NOT_UNIFORM, masked_lines
@@ -223,6 +225,26 @@ class WriteField(PipelineStep):
         out.write_settings(job.settings, about | ({"gains": job.inputs.gains} if job.inputs.gains else {}))
 
 
+class WriteSurface(PipelineStep):
+    """Write the quantities on the surface of bodies, in triangles of the size of a voxel."""
+
+    @staticmethod
+    def wanted(job: Job) -> bool:
+        return bool(the_result(job).bodies)
+
+    @staticmethod
+    def run(job: Job) -> None:
+        result, gas = the_result(job), job.run.gas
+        edge = max(result.box.edges) / job.voxels
+        surface = surface_map(result.field, result.bodies, result.box, result.n_ambient, edge, result.quantity, gas)
+        job.out.write_surface(surface)
+        for name, values in surface.quantities.items():
+            present = values[values.isfinite()]
+            if len(present):
+                ends = f"{float(present.min()):.4g} to {float(present.max()):.4g}"
+                job.monitor.say(f"surface of the bodies: {name} {ends} {unit_shown(describe(name)[0])}".rstrip())
+
+
 class WriteRig(PipelineStep):
     """Write the refined calibration with its uncertainty; predictions use it from here on."""
 
@@ -311,7 +333,8 @@ class DrawErrors(PipelineStep):
     @staticmethod
     def run(job: Job) -> None:
         assert job.posterior is not None
-        begin, deviations = time.monotonic(), Deviations(job.quantities[0], job.run.gas.for_field(job.quantities[0]))
+        begin, gas = time.monotonic(), job.run.gas.for_field(job.quantities[0])
+        deviations = Deviations(job.quantities[0], gas, the_result(job).bodies)
         grid, ratio = Grid.of_resolution(job.measurement.box, VOXELS), 1.0
         if job.detail is not None and job.validation is not None and (coarse := ChooseDetail.coarse(job)) is not None:
             with job.monitor.counting("errors of the withheld view"):
@@ -382,7 +405,8 @@ class WriteReport(PipelineStep):
 
 
 STEPS: tuple[type[PipelineStep], ...] = (
-    CrossValidate, ChooseDetail, Fit, AddDetail, WriteField, WriteRig, Reproject, WriteAxis, DrawErrors, Bootstrap,
+    CrossValidate, ChooseDetail, Fit, AddDetail, WriteField, WriteSurface, WriteRig, Reproject, WriteAxis, DrawErrors,
+    Bootstrap,
 )  # fmt: skip
 CLOSING: tuple[type[PipelineStep], ...] = (Judge, WriteReport)
 """Run whatever became of the others, if there is a field."""

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
 from nerif.cli.arguments import check_output
 from nerif.cli.commands.output import say
 from nerif.cli.commands.settings import Flat, Settings, command
+from nerif.data.body_file import read_body
 from nerif.geometry import Ring
+from nerif.geometry.body import hidden_pixels
 from nerif.simulation.design import DesignSettings, Expectation, expect
 
 __all__ = ["Design", "main", "run"]
@@ -25,6 +27,10 @@ class Design(Settings):
     """Drawing to write, .png or .pdf."""
     force: bool = False
     """Overwrite an existing drawing."""
+    body: Path | None = None
+    """Surface of a body in the flow (.stl, .obj, .ply), in the frame of the ring: counts the pixels that it hides."""
+    unit: Literal["mm", "cm", "m", "in"] = "mm"
+    """Unit of its lengths."""
     flow: Annotated[DesignSettings, Flat] = field(default_factory=DesignSettings)
     ring: Annotated[Ring, Flat] = field(default_factory=Ring)
 
@@ -33,8 +39,13 @@ def run(settings: Design) -> Expectation:
     """Print the prediction, and draw it."""
     if settings.out is not None:
         check_output(settings.out, settings.force, endings=(".png", ".pdf"))
+    body = None if settings.body is None else read_body(settings.body, settings.unit, lambda line: say(f"note: {line}"))
     result = expect(settings.ring, settings.flow)
     _print(result, settings.flow)
+    if body is not None:
+        for camera in settings.ring.cameras(settings.flow.f_number):
+            share = float(hidden_pixels(camera, [body]).double().mean())
+            say(f"{f'hidden in view {camera.name}':<28}{f'{share:.1%}':>18}   by {body.name}")
     if settings.out is not None:
         from nerif.report.design_figure import save_design
 

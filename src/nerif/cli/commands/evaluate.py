@@ -68,7 +68,8 @@ def _print_volume(metrics: dict[str, Any]) -> None:
         motion = f"after a rigid motion of {shift:.3f} mm and {rotation:.3f} degrees"
         say(f"L2 aligned    {metrics['aligned']['l2']:8.3%}   {motion}")
     say(f"CC            {metrics['cc']:8.5f}")
-    say(f"SSIM          {metrics['ssim']:8.5f}")
+    undefined = "   not defined: fewer than 7 voxels along an edge, or a truth that does not vary"
+    say(f"SSIM          {metrics['ssim']:8.5f}{undefined if math.isnan(metrics['ssim']) else ''}")
     say(f"PSNR          {metrics['psnr']:8.2f} dB")
     say("   z [mm]      CC    SSIM   PSNR [dB]")
     for s in metrics["slices"]:

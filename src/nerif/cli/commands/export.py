@@ -14,7 +14,7 @@ from nerif.cli.commands.settings import Settings, command
 from nerif.common.conventions import InputError
 from nerif.data.exports import FORMATS, PROGRAMS, export, export_geometry
 from nerif.data.measurement import Measurement
-from nerif.data.volume import Volume, quantities_of
+from nerif.data.volume import quantities_of
 from nerif.geometry import Box, Grid
 from nerif.physics.quantities import GasChanges, derive, masked_lines
 from nerif.results.directory import ResultDirectory
@@ -64,11 +64,11 @@ def run(settings: Export) -> None:
         say(f"{settings.out}: {len(measurement.cameras)} views and {' x '.join(map(str, grid.shape))} voxels (z, y, x)")
         return
     result = ResultDirectory(settings.result)
-    (field, whole, n_ambient), quantity = result.field(), result.quantity()
+    (_, whole, _), quantity = result.field(), result.quantity()
     grid = _grid(settings, whole)
     quantities = settings.quantities or tuple(q for q in quantities_of(quantity) if q != "temperature")
     with counting_bar("sampling the field"):
-        reconstruction = Volume.of(field.sample(grid), grid, quantity, n_ambient)
+        reconstruction = result.sample(grid)
         gas = settings.gas.of(result.settings())
         volumes = [derive(reconstruction, q, gas) for q in quantities]
         export(settings.out, volumes, settings.force)

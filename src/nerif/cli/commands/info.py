@@ -95,6 +95,10 @@ def _measurement(path: Path, m: Measurement) -> None:
     for name, offset in m.frame_offsets.items():
         say(f"  frame offset   {name} {offset:+d}")
     say(f"  flow mask      {'yes' if m.flow_mask is not None else 'no'}")
+    for body in m.bodies:
+        say(f"  body           {body.name}: {len(body.faces)} triangles, {body.volume:.4g} mm3")
+    if m.hidden is not None:
+        say(f"  hidden         {int(m.hidden.sum())} pixels see a body")
     say(f"  valid pixels   {valid_pixels(m)}")
     columns = "".join(f"{f'valid {o.technique.data_name()}':>20}{f'rms {o.label}':>24}" for o in m.observations)
     say(f"  view            size [px]  pixel [mm]   centre to camera [mm]   to background [mm]{columns}")

@@ -63,7 +63,7 @@ def run(settings: Mask) -> Measurement:
     say(f"{settings.out}: the visual hull fills {float(hull.float().mean()):.1%} of the box")
     from nerif.report.displacement_figure import save_masks
 
-    save_masks(image, measurement)
+    save_masks(image, measurement, measurement.flow_mask)
     values = measurement.observations[0].technique.measured
     say(f"{image}: the masks over |{values}|; a mask that is too small costs more than one that is too large")
     return measurement

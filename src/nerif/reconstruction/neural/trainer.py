@@ -149,6 +149,7 @@ class Trainer:
             quantity=self.data.quantity,
             rig=[] if self.data.refinement is None else self.data.refinement.table(),
             axis=self.data.axis,
+            bodies=self.data.measurement.bodies,
         )
 
     # -- checkpoints -------------------------------------------------------------------------------------------------

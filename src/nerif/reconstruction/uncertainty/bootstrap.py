@@ -36,6 +36,7 @@ from nerif.data.volume import Volume
 from nerif.fields.base import Field
 from nerif.fields.grid import VoxelField
 from nerif.geometry import Camera, Grid
+from nerif.geometry.body import contained
 from nerif.physics.quantities import GasSettings
 from nerif.reconstruction.base import Reconstruction, Reconstructor
 from nerif.reconstruction.uncertainty.deviations import VOXELS, Deviations, blurred
@@ -63,7 +64,7 @@ class Original:
     @cached_property
     def volume(self) -> Volume:
         """The field on VOXELS voxels along the longest edge."""
-        return self.result.volume(Grid.of_resolution(self.result.box, VOXELS))
+        return replace(self.result, bodies=()).volume(Grid.of_resolution(self.result.box, VOXELS))
 
     @cached_property
     def projections(self) -> Maps:
@@ -150,7 +151,7 @@ class BootstrapDeviations(Deviations):
     """
 
     def __init__(self, main: Volume, gas: GasSettings, original: Original) -> None:
-        super().__init__(main, gas)
+        super().__init__(main, gas, original.result.bodies)
         self.original = original
         self.pixel = mean(original.measurement.pixel_sizes)  # mm, in the middle of the box
         self.detail: list[tuple[float, float]] = []  # mean square of a trial and of its truth, where that has any
@@ -159,7 +160,9 @@ class BootstrapDeviations(Deviations):
     def add_trial(self, member: Member, result: Reconstruction) -> None:
         """Add the error of a trial."""
         grid = member.truth.grid
-        both = result.volume(grid).values.double(), member.truth.values.double()
+        both = [v.values.double() for v in (replace(result, bodies=()).volume(grid), member.truth)]
+        if self.bodies:
+            both = [v.masked_fill(contained(self.bodies, grid.points()), 0.0) for v in both]
         self.add(both[0] - both[1], grid)
         fine = [float((v - blurred(v, grid, DETAIL_PX * self.pixel)).square().mean()) for v in both]
         if fine[1] > MIN_DETAIL * float(both[1].square().mean()):

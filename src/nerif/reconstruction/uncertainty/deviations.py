@@ -8,6 +8,7 @@ A single sample is noisy, so squares are averaged around each voxel by a Gaussia
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 from jaxtyping import Float
@@ -16,6 +17,7 @@ from torch import Tensor
 from nerif.data.volume import Volume, describe
 from nerif.fields.grid import VoxelField
 from nerif.geometry import Grid
+from nerif.geometry.body import Body, contained
 from nerif.physics.quantities import GasSettings, derive, deviation
 
 __all__ = ["TAILS", "VOXELS", "Deviations", "blurred", "certainty"]
@@ -49,11 +51,11 @@ def blurred(values: Tensor, grid: Grid, mm: float) -> Tensor:
 class Deviations:
     """Standard deviations of every quantity from samples of the error.
 
-    `main` is the field on the grid of the result.
+    `main` is the field on the grid of the result; errors within bodies do not count.
     """
 
-    def __init__(self, main: Volume, gas: GasSettings) -> None:
-        self.main, self.gas = main, gas
+    def __init__(self, main: Volume, gas: GasSettings, bodies: Sequence[Body] = ()) -> None:
+        self.main, self.gas, self.bodies = main, gas, bodies
         self.squares: list[Tensor] = []
         self.grid: Grid | None = None
 
@@ -74,13 +76,18 @@ class Deviations:
     def local(self) -> Float[Tensor, "z y x"]:
         """Return the rms of the samples around each voxel of `grid`."""
         assert self.grid is not None
-        edge = math.prod(self.grid.box.edges) ** (1 / 3)
-        return blurred(torch.stack(self.squares).mean(dim=0), self.grid, WIDTH * edge).sqrt()
+        width, mean = WIDTH * math.prod(self.grid.box.edges) ** (1 / 3), torch.stack(self.squares).mean(dim=0)
+        if not self.bodies:
+            return blurred(mean, self.grid, width).sqrt()
+        outside = (~contained(self.bodies, self.grid.points())).double()
+        share = blurred(outside, self.grid, width).clamp_min(1e-6)
+        return (blurred(mean * outside, self.grid, width) / share).sqrt()
 
     def std(self) -> Volume:
         """Return the standard deviation of the field."""
         assert self.grid is not None
         values = VoxelField.through(self.factor * self.local(), self.grid).sample(self.main.grid).clamp(min=0)
+        values = values.masked_fill(self.main.values.isnan(), math.nan)
         return Volume(values, self.main.grid, f"{self.main.quantity}_std")
 
     def volumes(self) -> list[Volume]:

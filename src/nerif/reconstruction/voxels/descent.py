@@ -357,4 +357,5 @@ class Descent:
             quantity=self.measurement.quantity,
             rig=[] if self.rig is None else self.rig.table(),
             axis=self.axis,
+            bodies=self.measurement.bodies,
         )

@@ -76,6 +76,17 @@ void main() {
   gl_FragDepth = depth;
 }`;
 
+const BODY_FRAGMENT = `
+precision highp float;
+in vec3 place;
+out vec4 colour;
+void main() {
+  vec3 ray = normalize(place - cameraPosition), normal = normalize(cross(dFdx(place), dFdy(place)));
+  if (dot(normal, ray) > 0.0) normal = -normal;
+  float diffuse = max(dot(normal, normalize(-ray + vec3(-0.35, 0.2, 0.55))), 0.0);
+  colour = vec4(vec3(0.50, 0.54, 0.58) * (0.45 + 0.6 * diffuse), 1.0);
+}`;
+
 function makeSpace(scene, canvas) {
   const renderer = new THREE.WebGLRenderer({ canvas, antialias: true, alpha: false, preserveDrawingBuffer: true });
   renderer.setClearColor(0xffffff, 1);
@@ -103,6 +114,11 @@ function makeSpace(scene, canvas) {
   );
   rays.position.copy(middle);
   world.add(rays);
+  for (const body of scene.bodies) {
+    const geometry = new THREE.BufferGeometry();
+    geometry.setAttribute("position", new THREE.Float32BufferAttribute(body.faces.flatMap((i) => body.vertices.slice(3 * i, 3 * i + 3)), 3));
+    world.add(new THREE.Mesh(geometry, new THREE.ShaderMaterial({ vertexShader: RAY_VERTEX, fragmentShader: BODY_FRAGMENT, glslVersion: THREE.GLSL3, side: 2 })));  // 2: THREE.DoubleSide
+  }
 
   function lines(points, colour, opacity, dashed) {
     const geometry = new THREE.BufferGeometry();

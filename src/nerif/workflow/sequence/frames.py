@@ -20,7 +20,6 @@ from nerif.analysis.metrics import correlation
 from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
 from nerif.data.measurement_sequence import MeasurementSequence
-from nerif.data.volume import Volume
 from nerif.fields.base import Field
 from nerif.fields.network import NeuralField
 from nerif.forward.path_integral import PathIntegral, project
@@ -28,7 +27,7 @@ from nerif.forward.registry import forward_model
 from nerif.geometry import Grid
 from nerif.physics.quantities import derive
 from nerif.reconstruction.aperture import apply_aperture
-from nerif.reconstruction.base import OnStep, Step
+from nerif.reconstruction.base import OnStep, Step, sampled
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.workflow.sequence.plan import Event, SequencePlan
 from nerif.workflow.sequence.store import DONE, MISSING, Frame, SequenceStore
@@ -110,7 +109,7 @@ def _frame(
 def finished_frame(plan: SequencePlan, field: NeuralField, measurement: Measurement, device: str) -> Frame:
     """Return the volumes of a field, and its scores in the views."""
     grid = Grid.of_resolution(measurement.box, plan.settings.voxels)
-    volume = Volume.of(field.sample(grid, device), grid, measurement.quantity, measurement.n_ambient)
+    volume = sampled(field, grid, measurement.quantity, measurement.n_ambient, measurement.bodies, device)
     volumes = [derive(volume, quantity, plan.settings.gas) for quantity in plan.settings.quantities]
     scores = _scores(plan.cold.model, field, apply_aperture(measurement, plan.cold.aperture), device)
     return Frame(field, volumes, scores, seconds=0.0, steps=0)

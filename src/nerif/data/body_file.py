@@ -1,0 +1,78 @@
+"""Files of bodies: STL, OBJ and PLY, as written by CAD programs and scanners."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from nerif.common.conventions import InputError
+from nerif.common.files import ending
+from nerif.geometry.body import UNITS, Body
+
+__all__ = ["FORMATS", "read_body"]
+
+FORMATS = (".stl", ".obj", ".ply")
+
+
+def read_body(
+    path: str | os.PathLike[str], unit: str = "mm", say: Callable[[str], object] = lambda line: None
+) -> Body:  # fmt: skip
+    """Read a model, in its own frame; its lengths become mm, and triangles that face inwards are turned.
+
+    Parameters
+    ----------
+    unit : of its lengths, one of UNITS
+    say : called with a line if triangles were turned
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, or the mesh is not closed.
+    """
+    path = Path(path)
+    if unit not in UNITS:
+        raise InputError(f"expected one of {', '.join(UNITS)}, got '{unit}'", field="unit")
+    if ending(path) not in FORMATS:
+        raise InputError(f"expected a mesh of triangles ({', '.join(FORMATS)}); export the model as STL", field=path)
+    if not path.is_file():
+        raise InputError("no such file; expected the mesh of a body", field=path)
+    vertices, faces = _triangles(path)
+    try:
+        body = Body(torch.from_numpy(vertices * UNITS[unit]), torch.from_numpy(faces), path.stem)
+    except InputError as error:
+        raise error.inside(path.parent) from None
+    if not body.inside_out:
+        return body
+    say(f"{path}: its triangles face inwards and were turned; if a program mirrored the model, it is mirrored here too")
+    return body.turned
+
+
+def _triangles(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and triangles of a file; vertices at the same place are one, triangles without area are left out."""
+    import trimesh
+
+    try:
+        mesh: Any = trimesh.load(path, force="mesh", process=False, skip_materials=True)
+        vertices, faces = np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.int64)
+    except Exception as error:  # trimesh has no error of its own
+        reason = f"{type(error).__name__}: {error}"
+        raise InputError(f"cannot be read as a mesh ({reason}); export the model as STL again", field=path) from None
+    if not len(faces):
+        raise InputError("expected triangles, got none; export surfaces, not points or curves", field=path)
+    if not np.isfinite(vertices).all():
+        raise InputError("expected finite vertices, got NaN or infinity", field=path)
+    size = float(np.ptp(vertices, axis=0).max()) or 1.0
+    _, first, index = np.unique(
+        np.round(vertices / size * SAME), axis=0, return_index=True, return_inverse=True
+    )  # fmt: skip
+    faces = index.ravel()[faces]
+    a, b, c = faces.T
+    return vertices[first], np.ascontiguousarray(faces[(a != b) & (b != c) & (c != a)])
+
+
+SAME = 1e6  # vertices at the same place, rounded to this part of the size: STL has single precision

@@ -1,0 +1,65 @@
+"""Quantities on the surface of bodies: triangles with values at their vertices, and their files."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from nerif.common.files import atomic
+from nerif.common.netcdf import opened, values
+from nerif.data.volume import describe
+from nerif.data.vti import write_vtp
+
+__all__ = ["SurfaceMap"]
+
+
+@dataclass(frozen=True)
+class SurfaceMap:
+    """Quantities at the vertices of triangles; NaN where they are unknown, as outside the box.
+
+    Parameters
+    ----------
+    vertices : (n, 3) mm, world frame
+    faces : (m, 3) vertices of each triangle
+    quantities : (n,) by name, such as density
+    attributes : numbers and texts of the result, such as n_ambient
+    """
+
+    vertices: Float[Tensor, "n 3"]
+    faces: Int[Tensor, "m 3"]
+    quantities: dict[str, Float[Tensor, " n"]]
+    attributes: dict[str, float | str] = field(default_factory=dict)
+
+    def write(self, path: str | os.PathLike[str]) -> None:
+        """Write a file for ParaView (.vtp) or NetCDF-4 (.nc), atomically."""
+        if Path(path).suffix.lower() == ".vtp":
+            write_vtp(path, self.vertices, self.faces, self.quantities, self.attributes)
+            return
+        import xarray as xr
+
+        dataset = xr.Dataset(
+            {
+                "vertices": (("vertex", "i"), self.vertices.numpy(), {"units": "mm"}),
+                "faces": (("face", "corner"), self.faces.numpy().astype("int32"), {"units": "1"}),
+                **{
+                    name: (("vertex",), x.numpy(), {"units": describe(name)[0], "long_name": describe(name)[1]})
+                    for name, x in self.quantities.items()
+                },
+            },
+            attrs=self.attributes,
+        )
+        with atomic(path) as part:
+            dataset.to_netcdf(part, engine="h5netcdf")
+
+    @classmethod
+    def read(cls, path: str | os.PathLike[str]) -> SurfaceMap:
+        """Read a NetCDF-4 file."""
+        with opened(path, "quantities on the surface of bodies (.nc)") as dataset:
+            arrays = {str(name): torch.from_numpy(values(dataset[name])) for name in dataset.data_vars}
+            attributes = {str(name): value for name, value in dataset.attrs.items()}
+        return cls(arrays.pop("vertices"), arrays.pop("faces").long(), arrays, attributes)
