@@ -44,7 +44,14 @@ def test_the_surface_has_the_index_of_the_field_and_its_density(surface):
     torch.testing.assert_close(surface.quantities["density"][known], ((N_AMBIENT - 1) + expected) / k)
     beyond = surface.vertices[:, 0] > 20.0
     assert torch.equal(~known, beyond)
-    assert 0.02 < float(beyond.double().mean()) < 0.3
+    assert 0.0 < float(beyond.double().mean()) < 0.2  # of triangles that reach into the box
+    assert not bool(beyond[surface.faces].all(dim=1).any())
+
+
+def test_a_large_surface_has_larger_triangles(monkeypatch):
+    monkeypatch.setattr("nerif.analysis.surface.MOST_TRIANGLES", 3000)
+    large = surface_map(make_phantom("gaussians", BOX, 0), [ball(15.0)], BOX, N_AMBIENT, 0.2)
+    assert 1000 < len(large.faces) < 12000
 
 
 def test_a_surface_comes_back_from_its_file(surface, tmp_path):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
+from torch import Tensor
 
 from nerif.data.surface import SurfaceMap
 from nerif.data.volume import INDEX
@@ -16,6 +17,7 @@ from nerif.physics.quantities import GasSettings
 
 __all__ = ["surface_map"]
 
+MOST_TRIANGLES = 30_000
 OUTWARDS = 1e-3  # of the edges of the triangles, by which points are off the surface
 
 
@@ -26,17 +28,12 @@ def surface_map(
 ) -> SurfaceMap:  # fmt: skip
     """Return a field, and of an index the density, on the surface of bodies in triangles with edges up to `edge` mm.
 
-    Where the surface is outside the box, or within another body, it is NaN.
+    Triangles outside the box are left out; they are larger where there would be more than MOST_TRIANGLES. Vertices
+    beyond the box or within another body are NaN.
     """
-    vertices, faces, count = [], [], 0
-    for body in bodies:
-        corners, triangles, outwards = fine_triangles(body, edge)
-        vertices.append(corners + OUTWARDS * edge * outwards)
-        faces.append(triangles + count)
-        count += len(corners)
-    points = torch.cat(vertices)
-    lower, upper = (points.new_tensor(corner) for corner in (box.lower, box.upper))
-    outside = ((points < lower) | (points > upper)).any(dim=-1) | contained(bodies, points)
+    points, faces, outside = _within(bodies, box, edge)
+    if len(faces) > MOST_TRIANGLES:
+        points, faces, outside = _within(bodies, box, edge * (len(faces) / MOST_TRIANGLES) ** 0.5)
     values = torch.cat([field.value(part).cpu().double() for part in in_chunks(points.float())])
     values = values.masked_fill(outside, torch.nan)
     quantities, attributes = {quantity: values}, dict[str, float | str]()
@@ -45,4 +42,20 @@ def surface_map(
         k = gladstone_dale(gas.composition, gas.wavelength_nm)
         quantities = {"density": density_from_index(values, n_ambient, k), **quantities}
         attributes = {"n_ambient": n_ambient, "gas": gas.composition, "gladstone_dale_m3_kg-1": k}
-    return SurfaceMap(points, torch.cat(faces), {n: v.float() for n, v in quantities.items()}, attributes)
+    return SurfaceMap(points, faces, {n: v.float() for n, v in quantities.items()}, attributes)
+
+
+def _within(bodies: Sequence[Body], box: Box, edge: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Vertices and triangles of bodies that reach into a box, and which vertices have no field."""
+    vertices, faces, count = [], [], 0
+    for body in bodies:
+        corners, triangles, outwards = fine_triangles(body, edge)
+        vertices.append(corners + OUTWARDS * edge * outwards)
+        faces.append(triangles + count)
+        count += len(corners)
+    points, every = torch.cat(vertices), torch.cat(faces)
+    lower, upper = (points.new_tensor(corner) for corner in (box.lower, box.upper))
+    beyond = ((points < lower) | (points > upper)).any(dim=-1)
+    used, index = every[~beyond[every].all(dim=1)].unique(return_inverse=True)
+    points = points[used]
+    return points, index, beyond[used] | contained(bodies, points)

@@ -24,6 +24,7 @@ def draw_surface(figure: Figure, surface: SurfaceMap, quantity: str) -> None:
     from matplotlib import colormaps
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
+    from matplotlib.ticker import MaxNLocator
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
     corners = surface.vertices[surface.faces].numpy()
@@ -43,4 +44,6 @@ def draw_surface(figure: Figure, surface: SurfaceMap, quantity: str) -> None:
         axes.set_proj_type("ortho")
         axes.view_init(ELEVATION, azimuth)
         axes.tick_params(labelsize=6)
+        for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
+            axis.set_major_locator(MaxNLocator(4))
     figure.colorbar(scale, ax=list(every), label=label_of(quantity), shrink=0.7, pad=0.08)
