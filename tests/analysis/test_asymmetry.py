@@ -99,6 +99,7 @@ def test_a_withheld_half_is_predicted_and_evaluated_again(jet_file, capsys):
     assert again["views"][0]["cc"] == pytest.approx(metrics["views"][0]["cc"], abs=1e-4)
 
 
+@pytest.mark.slow
 def test_a_half_is_withheld_for_cross_validation(jet_file):
     metrics = reconstruct(jet_file, jet_file.parent / "whole")
     assert metrics["cross_validation"]["views"][0]["name"] in ("0deg left", "0deg right")

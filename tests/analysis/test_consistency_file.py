@@ -38,6 +38,7 @@ def test_files_of_another_kind_are_refused_with_a_remedy(tmp_path, text):
     assert "check the measurement again" in str(error.value)
 
 
+@pytest.mark.slow
 def test_the_command_replaces_findings_of_its_measurement_alone(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert main(["simulate", "-o", "m.nc", *SMALL]) == 0

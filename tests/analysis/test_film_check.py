@@ -107,6 +107,7 @@ def test_of_seven_views_two_that_are_late_together_are_named():
     assert frames_of(shifts_of(late(frames, {1: 2, 4: 2}))) == [0, 2, 0, 0, 2, 0, 0]
 
 
+@pytest.mark.slow
 def test_synchronous_and_steady_films_have_no_late_view(synchronous):
     shifts = shifts_of(synchronous)
     assert frames_of(shifts) == [0, 0, 0, 0]
@@ -175,6 +176,7 @@ def test_frames_without_all_views_are_avoided(synchronous):
     assert any("one view: its film cannot be compared" in remark for remark in alone.remarks)
 
 
+@pytest.mark.slow
 def test_the_command_checks_a_store(synchronous, tmp_path, capsys):
     pytest.importorskip("zarr", reason="pip install '.[sequence]'")
     names = synchronous[0].names[1:]

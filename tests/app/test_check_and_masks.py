@@ -187,6 +187,7 @@ def keys(driver: Any, *presses: str) -> None:
         chain.perform()
 
 
+@pytest.mark.slow
 def test_keys_of_the_brush_act_in_the_editor_alone(browser, server):
     opened(browser, server, "displacement", LINE)
     wait_for(browser, "return document.querySelector('.cropper img') !== null")

@@ -200,6 +200,7 @@ sys.exit(main())
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(signal, "SIGUSR1"), reason="needs a signal to stand in for Ctrl-Break")
 def test_ctrl_break_stops_a_run_as_ctrl_c_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     measurement, out = tmp_path / "m.nc", tmp_path / "r"

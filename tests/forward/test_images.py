@@ -237,6 +237,7 @@ def test_detail_is_added_from_images_and_from_their_displacements(balls, kind, r
     assert error(balls, SimpleNamespace(field=posterior.field)) < 0.5 * error(balls, SimpleNamespace(field=weak))
 
 
+@pytest.mark.slow
 def test_a_drift_of_the_light_is_fitted(balls):
     assert error(balls, NETWORK(photographed(balls, gain=0.05))) < 0.16
 

@@ -67,6 +67,7 @@ def posterior(plume):
     return Choice(passes=1).solve(*details)
 
 
+@pytest.mark.slow
 def test_voxels_are_smaller_than_pixels(plume):
     measurement = plume[1]
     pixels = [camera.pixel_size(torch.zeros(3, dtype=torch.float64)) for camera in measurement.cameras]
