@@ -176,37 +176,37 @@ def _to_box(boxes, node, point):
 
 
 @njit(nogil=True)
-def _dot(a, b):
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-@njit(nogil=True)
-def _on_triangle(corner, point):
-    """The point of a triangle that is closest to a point."""
-    a, b, c = corner[0], corner[1], corner[2]
-    ab, ac = b - a, c - a
-    d1, d2 = _dot(ab, point - a), _dot(ac, point - a)
+def _weights(corner, point):
+    """Weights of the corners b and c, beside a, at the point of a triangle that is closest to a point."""
+    d1 = d2 = d3 = d4 = d5 = d6 = 0.0
+    for i in range(3):
+        ab, ac = corner[1, i] - corner[0, i], corner[2, i] - corner[0, i]
+        d1 += ab * (point[i] - corner[0, i])
+        d2 += ac * (point[i] - corner[0, i])
+        d3 += ab * (point[i] - corner[1, i])
+        d4 += ac * (point[i] - corner[1, i])
+        d5 += ab * (point[i] - corner[2, i])
+        d6 += ac * (point[i] - corner[2, i])
     if d1 <= 0.0 and d2 <= 0.0:
-        return a.copy()
-    d3, d4 = _dot(ab, point - b), _dot(ac, point - b)
+        return 0.0, 0.0
     if d3 >= 0.0 and d4 <= d3:
-        return b.copy()
-    d5, d6 = _dot(ab, point - c), _dot(ac, point - c)
+        return 1.0, 0.0
     if d6 >= 0.0 and d5 <= d6:
-        return c.copy()
+        return 0.0, 1.0
     vc, vb, va = d1 * d4 - d3 * d2, d5 * d2 - d1 * d6, d3 * d6 - d5 * d4
     if vc <= 0.0 and d1 >= 0.0 and d3 <= 0.0:
-        return a + d1 / (d1 - d3) * ab
+        return d1 / (d1 - d3), 0.0
     if vb <= 0.0 and d2 >= 0.0 and d6 <= 0.0:
-        return a + d2 / (d2 - d6) * ac
+        return 0.0, d2 / (d2 - d6)
     if va <= 0.0 and d4 >= d3 and d5 >= d6:
-        return b + (d4 - d3) / ((d4 - d3) + (d5 - d6)) * (c - b)
-    return a + vb / (va + vb + vc) * ab + vc / (va + vb + vc) * ac
+        w = (d4 - d3) / ((d4 - d3) + (d5 - d6))
+        return 1.0 - w, w
+    return vb / (va + vb + vc), vc / (va + vb + vc)
 
 
 @njit(nogil=True)
 def _closest(boxes, begins, corners, points):
-    where, face = np.empty((len(points), 3)), np.zeros(len(points), np.int64)
+    where, face, on = np.empty((len(points), 3)), np.zeros(len(points), np.int64), np.empty(3)
     stack, inner = np.empty(DEPTH, np.int64), len(begins) - 2
     for i in range(len(points)):
         best = np.inf
@@ -224,9 +224,12 @@ def _closest(boxes, begins, corners, points):
                 count += 2
                 continue
             for k in range(begins[node - inner], begins[node - inner + 1]):
-                on = _on_triangle(corners[k], points[i])
-                squared = _dot(on - points[i], on - points[i])
+                v, w = _weights(corners[k], points[i])
+                squared = 0.0
+                for a in range(3):
+                    on[a] = (1.0 - v - w) * corners[k, 0, a] + v * corners[k, 1, a] + w * corners[k, 2, a]
+                    squared += (on[a] - points[i, a]) ** 2
                 if squared < best:
                     best, face[i] = squared, k
-                    where[i, 0], where[i, 1], where[i, 2] = on[0], on[1], on[2]
+                    where[i] = on
     return where, face
