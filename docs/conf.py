@@ -40,6 +40,7 @@ sphinx_gallery_conf = {  # the notebooks: scripts that run when the site is buil
     "abort_on_example_error": True,
     "download_all_examples": False,
     "show_signature": False,
+    "write_computation_times": False,  # a page with scripts from the web
 }
 
 # Markdown: $...$ and $$...$$ (label) for formulas, links to headings of other pages
