@@ -237,3 +237,15 @@ def test_invalid_files(volumes, tmp_path):
         export(tmp_path / "v.stl", volumes)
     with refused("volume 'index_excess'"):
         Volume(VALUES.movedim(0, 2), GRID)
+
+
+def test_a_quantity_that_is_masked_everywhere_is_read_and_an_index_is_not(tmp_path):
+    grid = Grid.of_resolution(Box.cube(10.0), 4)
+    nothing = torch.full(grid.shape, torch.nan)
+    notes = {"masked_voxels": 64, "masked_where": "the pressure is not uniform"}
+    index = Volume.of(nothing, grid, "index_excess", 1.00027)
+    write_netcdf(tmp_path / "v.nc", [index, Volume(nothing, grid, "temperature", "K", notes=notes)])
+    assert bool(read_volume(tmp_path / "v.nc", "temperature").values.isnan().all())
+    for gaps in (False, True):
+        with refused(tmp_path / "v.nc"):
+            read_volume(tmp_path / "v.nc", gaps=gaps)

@@ -72,6 +72,15 @@ def test_a_cavity_is_outside_and_overlapping_parts_are_inside():
     assert contained([outer, moved], x).tolist() == [True, True, True]
 
 
+def test_triangles_that_face_inwards_are_turned():
+    body = cuboid()
+    turned = replace(body, faces=body.faces.flip(1))
+    assert turned.volume == pytest.approx(1000.0)
+    assert torch.equal(turned.contains(points(100, 14.0)), body.contains(points(100, 14.0)))
+    mirrored = replace(body, vertices=body.vertices * torch.tensor([-1.0, 1.0, 1.0]))
+    assert mirrored.volume == pytest.approx(1000.0)
+
+
 def test_a_moved_body_contains_the_moved_points():
     body, x = cuboid((-5.0, -3.0, -1.0), (5.0, 3.0, 1.0)), points(1000, 14.0, 5)
     rotation = rotation_matrix(torch.tensor([0.3, -0.8, 0.2], dtype=torch.float64))

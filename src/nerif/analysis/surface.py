@@ -31,10 +31,11 @@ def surface_map(
     Triangles outside the box are left out; they are larger where there would be more than MOST_TRIANGLES. Vertices
     beyond the box or within another body are NaN.
     """
+    field = field.to("cpu")
     points, faces, outside = _within(bodies, box, edge)
     if len(faces) > MOST_TRIANGLES:
         points, faces, outside = _within(bodies, box, edge * (len(faces) / MOST_TRIANGLES) ** 0.5)
-    values = torch.cat([field.value(part).cpu().double() for part in in_chunks(points.float())])
+    values = torch.cat([field.value(part).double() for part in in_chunks(points.float())])
     values = values.masked_fill(outside, torch.nan)
     quantities, attributes = {quantity: values}, dict[str, float | str]()
     if quantity == INDEX:

@@ -17,6 +17,7 @@ from nerif.geometry.body import UNITS, Body
 __all__ = ["FORMATS", "read_body"]
 
 FORMATS = (".stl", ".obj", ".ply")
+SAME = 1e6  # parts of the size, to which vertices are rounded to be the same: STL has single precision
 
 
 def read_body(
@@ -46,10 +47,10 @@ def read_body(
         body = Body(torch.from_numpy(vertices * UNITS[unit]), torch.from_numpy(faces), path.stem)
     except InputError as error:
         raise error.inside(path.parent) from None
-    if not body.inside_out:
-        return body
-    say(f"{path}: its triangles face inwards and were turned; if a program mirrored the model, it is mirrored here too")
-    return body.turned
+    if not np.array_equal(body.faces.numpy(), faces):
+        about = "if a program mirrored the model, it is mirrored here too"
+        say(f"{path}: its triangles face inwards and were turned; {about}")
+    return body
 
 
 def _triangles(path: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -67,12 +68,8 @@ def _triangles(path: Path) -> tuple[np.ndarray, np.ndarray]:
     if not np.isfinite(vertices).all():
         raise InputError("expected finite vertices, got NaN or infinity", field=path)
     size = float(np.ptp(vertices, axis=0).max()) or 1.0
-    _, first, index = np.unique(
-        np.round(vertices / size * SAME), axis=0, return_index=True, return_inverse=True
-    )  # fmt: skip
+    rounded = np.round(vertices / size * SAME)
+    _, first, index = np.unique(rounded, axis=0, return_index=True, return_inverse=True)
     faces = index.ravel()[faces]
     a, b, c = faces.T
     return vertices[first], np.ascontiguousarray(faces[(a != b) & (b != c) & (c != a)])
-
-
-SAME = 1e6  # vertices at the same place, rounded to this part of the size: STL has single precision

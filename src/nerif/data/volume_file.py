@@ -103,7 +103,7 @@ def read_volume(path: str | os.PathLike[str], quantity: str | None = None, gaps:
     index = quantity in ("index_excess", "n")
     allowed = gaps or (not index and "masked_voxels" in volume.notes)
     finite = torch.isfinite(volume.values)
-    if not bool(finite.any() if allowed else finite.all()):
+    if not bool(finite.all()) and (not allowed or (index and not bool(finite.any()))):
         raise InputError(f"variable '{quantity}': expected finite values, got NaN or infinity; fill them", field=path)
     if index and not bool((volume.values[finite].abs() <= LARGEST_INDEX).all()):
         raise InputError(

@@ -40,7 +40,7 @@ class Body:
     Parameters
     ----------
     vertices : (n, 3) corners of the triangles, mm, world frame
-    faces : (m, 3) vertices of each triangle, counter-clockwise as seen from outside
+    faces : (m, 3) vertices of each triangle, counter-clockwise as seen from outside; turned if they all face inwards
     name : in messages
 
     Raises
@@ -74,6 +74,8 @@ class Body:
         wrong = f"{against} edges whose triangles face opposite sides{remedy}"
         check(not against, "triangles that all face outwards", wrong)
         check(self.volume != 0, "a body", "a surface without a volume; a sheet needs a thickness")
+        if self.volume < 0:
+            object.__setattr__(self, "faces", self.faces.flip(1))
 
     @property
     def _edges(self) -> tuple[int, int]:
@@ -87,23 +89,13 @@ class Body:
         return int(odd.sum()), int(((balance != 0) & ~odd).sum())
 
     @property
-    def inside_out(self) -> bool:
-        """Whether its triangles face inwards, as those of a model do that a program has mirrored."""
-        return self.volume < 0
-
-    @property
-    def turned(self) -> Body:
-        """The body with triangles that face the other side."""
-        return replace(self, faces=self.faces.flip(1))
-
-    @property
     def corners(self) -> Float[Tensor, "m 3 3"]:
         """The corners of each triangle, mm."""
         return self.vertices[self.faces]
 
     @property
     def volume(self) -> float:
-        """Enclosed volume, mm3; below 0 if the triangles face inwards."""
+        """Enclosed volume, mm3."""
         a, b, c = (self.corners - self.vertices.mean(dim=0)).unbind(dim=1)
         return float((a * torch.linalg.cross(b, c)).sum()) / 6
 

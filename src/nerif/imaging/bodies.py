@@ -6,8 +6,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
@@ -87,17 +85,10 @@ def _check_silhouette(measurement: Measurement, body: Body) -> None:
     if here > FITS_NOT:
         return
     for name, matrix in orientations():
-        other = overlap(_turned(body, matrix))
+        other = overlap(replace(body, vertices=body.vertices @ matrix.T))
         if other > FITS:
             raise InputError(
                 f"expected pixels without data where the views see it, got {here:.0%} overlap, but {other:.0%} with "
                 f"its axes as {name}; export it with these axes, or check the world frame of the calibration",
                 field=body.name,
             )
-
-
-def _turned(body: Body, matrix: Float[Tensor, "3 3"]) -> Body:
-    """The body with other axes, its triangles facing outwards."""
-    mirrored = float(torch.linalg.det(matrix)) < 0
-    faces = body.faces.flip(1) if mirrored else body.faces
-    return replace(body, vertices=body.vertices @ matrix.T, faces=faces)

@@ -138,10 +138,9 @@ def _curves(result: Result) -> list[tuple[str, str]]:
         curves.append((title, svg(lambda axes: draw(axes, *data))))
 
     if result.surface is not None:
-        for quantity in result.surface.quantities:
-            title = f"{name_of(quantity).capitalize()} on the surface of the bodies"
-            curves.append((title, image(partial(draw_surface, surface=result.surface, quantity=quantity), 7, 3.6, 10)))
-            break
+        quantity = next(iter(result.surface.quantities))  # the density, of an index
+        title = f"{name_of(quantity).capitalize()} on the surface of the bodies"
+        curves.append((title, image(partial(draw_surface, surface=result.surface, quantity=quantity), 7, 3.6, 10)))
     if result.history:
         add("Convergence", figures.draw_history, result.history)
     if result.reprojection is not None:
