@@ -45,13 +45,13 @@ def test_one_page_has_the_loss_and_gradient_of_the_package(tmp_path, ball, box) 
     s, interval = page.sample(batch, 16, generator)
     (part,) = training.data.batch(index)
     assert torch.allclose(part.rays.direction, batch.direction, atol=1e-6)
-    ambient = training.data.ambient.sample(256, torch.Generator().manual_seed(2))
+    ambient = training.data.gauge.sample(256, torch.Generator().manual_seed(2))[0]
     size = float(rays.displacement.square().mean().sqrt())
     ours = page.loss(field, batch, s, interval, ambient, size)
     ours.backward()
 
     piece = Piece(part, part.rays, s, interval, part.measured.numel())
-    training.objective.ambient_values = lambda count, _: theirs.network(theirs.normalise(ambient))  # the same points
+    training.objective.gauge_errors = lambda count, _: theirs.network(theirs.normalise(ambient))  # the same points
     loss, _ = training.objective(Batch([piece], piece.numbers))
     loss.backward()
     assert ours.item() == pytest.approx(loss.item(), rel=1e-4)

@@ -21,7 +21,7 @@ from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Grid, Ring
 from nerif.geometry.body import contained
 from nerif.imaging.bodies import with_bodies, without_bodies
-from nerif.reconstruction.gauge import AmbientRegion, visual_hull
+from nerif.reconstruction.gauge import Gauge, visual_hull
 from nerif.reconstruction.neural.presets import preset
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.results.directory import ResultDirectory
@@ -101,12 +101,12 @@ def test_pixels_without_data_that_show_the_body_mirrored_name_the_axis(flow):
 
 def test_ambient_points_and_hull_respect_bodies(flow):
     body = cuboid((10.0, -10.0, -10.0), (25.0, 10.0, 10.0))  # through the face x+
-    region = AmbientRegion.of(with_bodies(flow, [body]), ("x+",))
-    drawn = region.sample(2000, torch.Generator().manual_seed(0))
+    region = Gauge.of(with_bodies(replace(flow, ambient_faces=("x+",)), [body]))
+    drawn, _ = region.sample(2000, torch.Generator().manual_seed(0))
     assert not bool(contained([body], drawn).any())
     assert 500 < len(drawn) < 2000
     with refused("ambient_faces"):
-        AmbientRegion.of(replace(flow, bodies=(cuboid((15.0, -30.0, -30.0), (25.0, 30.0, 30.0)),)), ("x+",))
+        Gauge.of(replace(flow, ambient_faces=("x+",), bodies=(cuboid((15.0, -30.0, -30.0), (25.0, 30.0, 30.0)),)))
     grid = Grid.of_resolution(BOX, 20)
     nothing = torch.zeros_like(flow.usable)
     nothing[:, 8:24, 8:24] = True

@@ -233,7 +233,7 @@ def test_lenses_on_the_command_line(wide, tmp_path, capsys):
     wide.write(path)
     quick = ["--max-steps", "20", "--network.width", "16", "--voxels", "8", "--no-report"]
     assert main(["info", str(path)]) == 0
-    assert "aperture       12.5 mm, focused on their backgrounds" in capsys.readouterr().out
+    assert "aperture       12.5 mm, focused on the backgrounds" in capsys.readouterr().out
     assert main(["reconstruct", str(path), "-o", str(out), "--aperture", "off", *quick]) == 0
     assert main(["evaluate", str(out), "--measurement", str(path)]) == 0
     field, _, _ = ResultDirectory(out).field()
@@ -252,7 +252,7 @@ def test_lenses_on_the_command_line(wide, tmp_path, capsys):
     capsys.readouterr()
     assert main(["reconstruct", str(tmp_path / "thin.nc"), "-o", str(tmp_path / "t"), "--aperture", "on", *quick]) == 2
     told = capsys.readouterr().err
-    assert "expected a measurement that knows aperture_diameter" in told
+    assert "expected a measurement with aperture_diameter" in told
     assert len(told.splitlines()) == 1
     assert not (tmp_path / "t").exists()
 
@@ -278,4 +278,4 @@ def test_a_check_uses_the_lenses_by_default(wide, tmp_path, capsys):
     apply_aperture(wide, "off").write(tmp_path / "thin.nc")
     for more in ([], ["--refine", "cameras", "--time-limit", "1"]):
         assert main(["check", str(tmp_path / "thin.nc"), "--aperture", "on", *more]) == 2
-        assert "aperture: expected a measurement that knows aperture_diameter" in capsys.readouterr().err
+        assert "aperture: expected a measurement with aperture_diameter" in capsys.readouterr().err

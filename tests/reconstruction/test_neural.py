@@ -18,7 +18,7 @@ from nerif.forward.base import Weights
 from nerif.geometry import Grid, paper_rig
 from nerif.reconstruction.base import Reconstruction, Step
 from nerif.reconstruction.files import read_state, write_state
-from nerif.reconstruction.gauge import AmbientRegion
+from nerif.reconstruction.gauge import Gauge
 from nerif.reconstruction.neural import bins, callbacks, objective, trainer
 from nerif.reconstruction.neural.losses import LossWeights, by_differences
 from nerif.reconstruction.neural.neural import NeRIF
@@ -261,12 +261,12 @@ def test_masks_widen_the_ambient_region(measurement, ball):
     moving = (measurement.displacement.norm(dim=-1) > 0.01).float()[:, None]
     mask = torch.nn.functional.max_pool2d(moving, 3, 1, 1)[:, 0] > 0
     masked = replace(measurement, flow_mask=mask)
-    region = AmbientRegion.of(masked, ())
-    points = region.sample(400, torch.Generator().manual_seed(0))
+    region = Gauge.of(masked)
+    points, _ = region.sample(400, torch.Generator().manual_seed(0))
     assert len(points) == 400
     inside = ball(points.double()).abs() > 0.5 * 2e-4
     assert not bool(inside.any())
-    far = replace(region, faces=()).sample(20000, torch.Generator().manual_seed(1)).double()
+    far = replace(region, faces=()).sample(20000, torch.Generator().manual_seed(1))[0].double()
     in_hull = torch.ones(len(far), dtype=torch.bool)
     for camera, view_mask in zip(masked.cameras, mask, strict=True):
         column, row = camera.project(far).round().long().unbind(-1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import math
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -27,12 +28,14 @@ from nerif.geometry.plausibility import background_cuts, likely_cause, rays_on_l
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["MASKS", "Measurement", "Observation", "integrals_of", "measurement_of"]
+__all__ = ["MASKS", "Measurement", "Observation", "Region", "check_region", "integrals_of", "measurement_of"]
 
 MASKS = ("valid", "flow_mask", "hidden")
 """Fields of a measurement that are masks (view, row, column)."""
 WAVELENGTHS_NM = (100.0, 30000.0)  # ultraviolet to thermal infrared
 PIXELS_AT_A_TIME = 1 << 17  # whose rays are traced together
+Region = tuple[float, float, float, float, float, float]
+"""A box x0 x1 y0 y1 z0 z1, mm, which may be as small as a point."""
 
 
 @dataclass(frozen=True)
@@ -152,6 +155,7 @@ class Measurement:
     flow_mask : (view, row, column) True where there is flow, or None
     wavelength_nm : of the light, or None
     ambient_faces : faces of the box with ambient index (the gauge)
+    ambient_region : box x0 x1 y0 y1 z0 z1 in mm with ambient index, down to a point, or None
     maps : (view, row, column) or (view, row, column, c) of other techniques, by their names in the file, such as
         absorbance and absorbance_sigma; NaN: no data
     frame_offsets : by the names of views: instant i is frame i + offset of the view's film; 0 if not named
@@ -178,6 +182,7 @@ class Measurement:
     frame_offsets: Mapping[str, int] = field(default_factory=dict)
     bodies: tuple[Body, ...] = ()
     hidden: Bool[Tensor, "view row column"] | None = None
+    ambient_region: Region | None = None
 
     def __post_init__(self) -> None:
         self._check_maps()
@@ -186,6 +191,8 @@ class Measurement:
         if self.wavelength_nm is not None and not WAVELENGTHS_NM[0] <= self.wavelength_nm <= WAVELENGTHS_NM[1]:
             raise InputError(f"expected nanometres such as 532, got {self.wavelength_nm}", field="wavelength_nm")
         parse_faces(self.ambient_faces)
+        if self.ambient_region is not None:
+            check_region(self.ambient_region, self.box)
         self._check_observations()
         for name, any_ in zip(self.names, self.usable.flatten(1).any(dim=1).tolist(), strict=True):
             if not any_:
@@ -567,3 +574,18 @@ def measurement_of(
         tuple(cameras), box=box, n_ambient=n_ambient, wavelength_nm=wavelength_nm, ambient_faces=ambient_faces,
         **_arguments(maps),
     )  # fmt: skip
+
+
+def check_region(region: Region, box: Box | None = None) -> None:
+    """Raise InputError if a region x0 x1 y0 y1 z0 z1 (mm) is not a box, or is outside the box of a measurement."""
+    got = " ".join(f"{value:g}" for value in region)
+    lower, upper = region[::2], region[1::2]
+    if len(region) != 6 or not all(a <= b and abs(a) < math.inf > abs(b) for a, b in zip(lower, upper, strict=False)):
+        raise InputError(f"expected x0 x1 y0 y1 z0 z1 in mm, x0 <= x1, got {got}", field="ambient_region")
+    inside = box is None or all(
+        a >= c and b <= d for a, b, c, d in zip(lower, upper, box.lower, box.upper, strict=True)
+    )
+    if not inside:
+        assert box is not None
+        edges = " ".join(f"{value:g}" for pair in zip(box.lower, box.upper, strict=True) for value in pair)
+        raise InputError(f"expected a region within the box {edges} mm, got {got}", field="ambient_region")

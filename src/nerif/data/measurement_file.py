@@ -6,6 +6,7 @@ Each map of a technique is a variable on view, row, column (and component); the 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from torch import Tensor
 from nerif.common.conventions import COMPONENTS, DEFAULT_AMBIENT_FACES, InputError, parse_faces, whole
 from nerif.common.netcdf import reading, values
 from nerif.data.kinds import BOST, known_conventions
-from nerif.data.measurement import MASKS, Measurement
+from nerif.data.measurement import MASKS, Measurement, Region
 from nerif.forward.base import ForwardModel
 from nerif.forward.deflection import Deflection
 from nerif.forward.registry import TECHNIQUES, technique
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
 __all__ = [
-    "CONVENTIONS", "PLAIN", "encoding", "from_dataset", "map_names", "to_dataset", "variables",
+    "BODIES", "CONVENTIONS", "PLAIN", "bodies_of", "encoding", "from_dataset", "map_names", "to_dataset", "variables",
 ]  # fmt: skip
 
 PLAIN, CONVENTIONS, WITH_BODIES = BOST
@@ -53,8 +54,11 @@ RIG = {
     "body_vertices": (("body_vertex", "i"), "mm"),
     "body_faces": (("body_face", "body_corner"), "1"),
     "body_of_face": (("body_face",), "1"),
+    "body_rotation": (("body", "i", "j"), "1"),
+    "body_translation": (("body", "i"), "mm"),
 }
 """Dimensions and units of masks, of the variables of the rig, and of bodies."""
+BODIES = tuple(name for name in RIG if name.startswith("body_"))
 REQUIRED = ("intrinsics", "rotation", "translation", "box")
 BACKGROUND = ("background_normal", "background_offset")
 SIZES = {"i": 3, "j": 3, "coefficient": 5, "axis": 2, "corner": 2, "side": 2, "parameter": 6, "body_corner": 3}
@@ -146,6 +150,7 @@ def to_dataset(measurement: Measurement) -> xr.Dataset:
     more = data.keys() & {"pose_sigma", "tilt", "frame_offset"}
     plain = names == [Deflection.name] and pinholes and not lenses and not more
     with_bodies = bool(data.keys() & {"hidden", "body_vertices"})
+    with_bodies |= measurement.ambient_region is not None
     plain &= not with_bodies
     dataset.attrs = {
         "Conventions": PLAIN if plain else WITH_BODIES if with_bodies else CONVENTIONS,
@@ -153,6 +158,8 @@ def to_dataset(measurement: Measurement) -> xr.Dataset:
         "n_ambient": measurement.n_ambient,
         "ambient_faces": " ".join(measurement.ambient_faces),
     }
+    if measurement.ambient_region is not None:
+        dataset.attrs["ambient_region"] = " ".join(["box", *(f"{x:.9g}" for x in measurement.ambient_region)])
     if measurement.bodies:
         dataset["body_name"] = (("body",), np.array([body.name for body in measurement.bodies], dtype=object))
     if not pinholes:
@@ -171,7 +178,12 @@ def from_dataset(dataset: xr.Dataset) -> dict[str, Any]:
             field="attribute Conventions",
         )
     _check_variables(dataset)
-    faces = dataset.attrs.get("ambient_faces", " ".join(DEFAULT_AMBIENT_FACES))
+    faces, region = dataset.attrs.get("ambient_faces", " ".join(DEFAULT_AMBIENT_FACES)), None
+    stated = str(dataset.attrs.get("ambient_region", ""))
+    if stated.startswith("box"):
+        region = _region(stated)
+    elif stated:
+        faces = stated
     if not isinstance(faces, str):
         raise InputError(f"expected a text such as 'x- x+ y- y+', got {faces!r}", field="attribute ambient_faces")
     arguments = ("displacement", "sigma", *MASKS)
@@ -190,9 +202,21 @@ def from_dataset(dataset: xr.Dataset) -> dict[str, Any]:
         "n_ambient": _number(dataset, "n_ambient", "the ambient index, e.g. 1.00027", None if index else 1.0),
         "wavelength_nm": _number(dataset, "wavelength_nm", "nm") if "wavelength_nm" in dataset.attrs else None,
         "ambient_faces": parse_faces(faces, "attribute ambient_faces"),
+        "ambient_region": region,
         "frame_offsets": _frame_offsets(dataset),
         "bodies": _bodies(dataset),
     }
+
+
+def _region(text: str) -> Region:
+    """Return the region of a text 'box x0 x1 y0 y1 z0 z1', mm."""
+    try:
+        x0, x1, y0, y1, z0, z1 = (float(number) for number in text.split()[1:])
+    except ValueError:
+        raise InputError(
+            f"expected a text such as 'box -5 5 -5 5 -20 -15' (mm), got {text!r}", field="attribute ambient_region"
+        ) from None
+    return (x0, x1, y0, y1, z0, z1)
 
 
 def _meshes(bodies: tuple[Body, ...]) -> dict[str, np.ndarray]:
@@ -212,10 +236,19 @@ def _bodies(dataset: xr.Dataset) -> tuple[Body, ...]:
     """Return the bodies of the variables of a file."""
     if "body_vertices" not in dataset or "body_faces" not in dataset:
         return ()
-    vertices, faces = _array(dataset, "body_vertices"), _array(dataset, "body_faces").long()
-    number = _optional(dataset, "body_of_face", (len(faces),), 0.0).long()
+    arrays = {name: _array(dataset, name).numpy() for name in BODIES if name in dataset}
+    return bodies_of(arrays, _texts(dataset["body_name"]) if "body_name" in dataset else [])
+
+
+def bodies_of(arrays: Mapping[str, np.ndarray], names: Sequence[str] = ()) -> tuple[Body, ...]:
+    """Return the bodies of the arrays of a file by their names (BODIES), at their poses."""
+    vertices, faces = torch.from_numpy(arrays["body_vertices"]), torch.from_numpy(arrays["body_faces"]).long()
+    number = torch.from_numpy(arrays.get("body_of_face", np.zeros(len(faces)))).long()
     count = int(number.max()) + 1
-    names = _texts(dataset["body_name"]) if "body_name" in dataset else []
+    rotations = torch.from_numpy(arrays.get("body_rotation", np.tile(np.eye(3), (count, 1, 1))))
+    translations = torch.from_numpy(arrays.get("body_translation", np.zeros((count, 3))))
+    if len(rotations) != count or len(translations) != count:
+        raise InputError(f"expected a pose for each of {count} bodies", field="variable 'body_rotation'")
     bodies = []
     for i in range(count):
         used, index = faces[number == i].unique(return_inverse=True)
@@ -225,7 +258,10 @@ def _bodies(dataset: xr.Dataset) -> tuple[Body, ...]:
                 f"expected for {name} triangles of vertices 0 to {len(vertices) - 1}, got others",
                 field="variable 'body_faces'",
             )
-        bodies.append(Body(vertices[used], index, name))
+        body = Body(vertices[used], index, name)
+        if "body_rotation" in arrays or "body_translation" in arrays:
+            body = body.moved(rotations[i], translations[i])
+        bodies.append(body)
     return tuple(bodies)
 
 

@@ -20,7 +20,7 @@ from nerif.common.installation import install
 from nerif.common.netcdf import reading, values
 from nerif.data.kinds import SEQUENCE, known_conventions, reading_as
 from nerif.data.measurement import Measurement
-from nerif.data.measurement_file import CONVENTIONS, PLAIN, map_names, variables
+from nerif.data.measurement_file import BODIES, CONVENTIONS, PLAIN, map_names, variables
 from nerif.forward.registry import TECHNIQUES
 
 if TYPE_CHECKING:
@@ -151,6 +151,11 @@ class MeasurementSequence:
             return Measurement.from_dataset(one.drop_vars(["time", WRITTEN], errors="ignore"))
         except InputError as error:
             raise error.inside(place) from None
+
+    def body_arrays(self) -> dict[str, xr.DataArray]:
+        """Return the meshes of the bodies in the flow and their poses, by the names in the file."""
+        with _opened(self.path) as dataset:
+            return {name: dataset[name].load() for name in BODIES if name in dataset}
 
     def fullest(self) -> Measurement:
         """Return the first frame with all views and techniques of the store; its cameras and box are those of all.

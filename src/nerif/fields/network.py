@@ -176,6 +176,8 @@ class Network(nn.Module):
 
     layered: ClassVar[bool] = True
     """Whether the n head is a function of the last layer only."""
+    beside: ClassVar[int] = 0
+    """Inputs of the first layer beside the encoding."""
     gains: Tensor
     bounds: Tensor
     waves: Tensor
@@ -185,7 +187,7 @@ class Network(nn.Module):
         super().__init__()
         self.shape, self.limits = shape, bounds
         self.register_buffer("bounds", torch.tensor(bounds, dtype=torch.float64))
-        e, w = encoded_width(shape.octaves, shape.directions), shape.width
+        e, w = encoded_width(shape.octaves, shape.directions) + self.beside, shape.width
         waves, octave = wave_vectors(shape.octaves, shape.directions)
         self.register_buffer("waves", waves, persistent=False)
         self.register_buffer("octave", octave, persistent=False)

@@ -23,13 +23,24 @@ from nerif.geometry.rays import Rays
 if TYPE_CHECKING:
     from nerif.geometry.mesh_kernel import Tree
 
-__all__ = ["UNITS", "Body", "check_place", "contained", "fine_triangles", "hidden_pixels", "orientations"]
+__all__ = [
+    "UNITS",
+    "Body",
+    "check_place",
+    "contained",
+    "fine_triangles",
+    "from_surface",
+    "hidden_pixels",
+    "orientations",
+]
 
 UNITS = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4}
 """Lengths of models in files, mm."""
 LENS_RAYS = 16  # per pixel with a lens or a window
 RAYS_AT_A_TIME = 1 << 16
 MOST_PARTS = 200  # of the edge of a triangle
+TOUCHING = 1e-4  # of the reach, below which a point is taken to be this far from the surface
+CORNER = 1e-9  # of barycentric coordinates: 0
 TINY, LARGE = 0.01, 20.0  # of the box, beyond which the size of a body is not meant
 
 
@@ -114,6 +125,10 @@ class Body:
         """Return the body at R x + t, mm."""
         return replace(self, vertices=self.vertices @ rotation.double().T + translation.double())
 
+    def in_units(self, centre: tuple[float, float, float], unit: float) -> Body:
+        """Return the body in coordinates (x - centre) / unit."""
+        return replace(self, vertices=(self.vertices - self.vertices.new_tensor(centre)) / unit)
+
     @cached_property
     def _tree(self) -> Tree:
         from nerif.geometry.mesh_kernel import tree_of
@@ -152,7 +167,7 @@ class Body:
         from nerif.geometry.mesh_kernel import closest
 
         flat = points.detach().reshape(-1, 3).cpu().double().contiguous()
-        where, face = closest(self._tree, flat.numpy())
+        where, _, face = closest(self._tree, flat.numpy())
         return torch.from_numpy(where).reshape(points.shape).to(points), torch.from_numpy(face).reshape(
             points.shape[:-1]
         ).to(points.device)
@@ -201,8 +216,57 @@ def contained(bodies: Sequence[Body], points: Points) -> Bool[Tensor, "*batch"]:
     return inside
 
 
+def from_surface(
+    bodies: Sequence[Body], points: Points, reach: float
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3 3"]]:
+    """Return the direction from the nearest surface, faded with the distance d from it, and its derivative.
+
+        v = (1 - (d / reach)^2)^2 n,    n = grad d,    dv/dx = w' n n^T + w H
+
+    H, the Hessian of d, is 0 beside a face, (1 - n n^T - t t^T) / d beside an edge along t, (1 - n n^T) / d beside a
+    vertex. Beyond `reach` both are 0.
+    """
+    from nerif.geometry.mesh_kernel import closest
+
+    flat = points.detach().cpu().double().contiguous()
+    best = torch.full((len(flat),), torch.inf, dtype=torch.float64)
+    v, slope = torch.zeros_like(flat), flat.new_zeros(len(flat), 3, 3)
+    for body in bodies:
+        lower, upper = body.extent
+        near = ((flat > lower - reach) & (flat < upper + reach)).all(dim=-1).nonzero().flatten()
+        where, weights, face = map(torch.from_numpy, closest(body._tree, flat[near].numpy(), reach))
+        offset = flat[near] - where
+        distance = offset.norm(dim=-1)
+        nearer = (distance < best[near]).nonzero().flatten()  # not if it is NaN
+        d, index = distance[nearer].clamp_min(TOUCHING * reach), near[nearer]
+        n = offset[nearer] / d[:, None]
+        u = d / reach
+        w, fall = (1 - u**2) ** 2, -4 * u * (1 - u**2) / reach
+        bend = _bend(n, weights[nearer], body.corners[face[nearer]]) / d[:, None, None]
+        best[index], v[index] = distance[nearer], w[:, None] * n
+        slope[index] = fall[:, None, None] * n[:, :, None] * n[:, None] + w[:, None, None] * bend
+    return v.to(points), slope.to(points)
+
+
+def _bend(
+    n: Float[Tensor, "n 3"], weights: Float[Tensor, "n 3"], corners: Float[Tensor, "n 3 3"]
+) -> Float[Tensor, "n 3 3"]:
+    """Distance times its Hessian, for its gradient n and barycentric coordinates of the nearest point of a triangle."""
+    zero = weights <= CORNER
+    across = torch.eye(3).to(n) - n[:, :, None] * n[:, None]
+    opposite = zero.long().argmax(dim=1)  # of the edge that has the point, if one coordinate is 0
+    row = torch.arange(len(n))
+    edge = corners[row, (opposite + 2) % 3] - corners[row, (opposite + 1) % 3]
+    along = torch.nn.functional.normalize(edge, dim=-1)
+    on_edge = across - along[:, :, None] * along[:, None]
+    zeros = zero.sum(dim=1)[:, None, None]
+    return torch.where(zeros == 0, 0.0, torch.where(zeros == 1, on_edge, across))
+
+
 def hidden_pixels(camera: Camera, bodies: Sequence[Body], margin: int = 0, step: int = 1) -> Bool[Tensor, "row column"]:
     """Return the pixels of a camera that see a body, with any part of their lens or window.
+
+    A body so thin that no pixel sees it with its centre hides those that see it with a corner.
 
     Parameters
     ----------
@@ -210,6 +274,18 @@ def hidden_pixels(camera: Camera, bodies: Sequence[Body], margin: int = 0, step:
     step : rows and columns from one pixel of the result to the next
     """
     pixels = camera.pixel_grid()[::step, ::step]
+    hidden = _seen(camera, bodies, pixels)
+    if not bool(hidden.any()):
+        half = pixels.new_tensor([(-0.5, -0.5), (-0.5, 0.5), (0.5, -0.5), (0.5, 0.5)])
+        hidden = torch.stack([_seen(camera, bodies, pixels + shift) for shift in half]).any(dim=0)
+    if margin:
+        grown = torch.nn.functional.max_pool2d(hidden[None].float(), 2 * margin + 1, 1, margin)
+        hidden = grown[0] > 0
+    return hidden
+
+
+def _seen(camera: Camera, bodies: Sequence[Body], pixels: Float[Tensor, "row column 2"]) -> Bool[Tensor, "row column"]:
+    """Which pixels see a body with any part of their lens or window."""
     hidden = torch.zeros(pixels.shape[:2], dtype=torch.bool)
     each = LENS_RAYS if camera.lens is not None and (camera.lens.diameter > 0 or camera.lens.window > 0) else 1
     rows = max(1, RAYS_AT_A_TIME // pixels.shape[1])
@@ -221,9 +297,6 @@ def hidden_pixels(camera: Camera, bodies: Sequence[Body], margin: int = 0, step:
             for bundle in bundles:
                 hit = body.hits(bundle).isfinite().reshape(*part.shape[:2], -1).any(dim=-1)
                 hidden[first : first + rows] |= hit
-    if margin:
-        grown = torch.nn.functional.max_pool2d(hidden[None].float(), 2 * margin + 1, 1, margin)
-        hidden = grown[0] > 0
     return hidden
 
 

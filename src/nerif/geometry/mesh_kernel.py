@@ -75,11 +75,14 @@ def windings(tree: Tree, points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " 
 
 
 def closest(
-    tree: Tree, points: Float[np.ndarray, "n 3"]
-) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, " n"]]:  # fmt: skip
-    """Return the points of the mesh that are closest to points, and the triangles on which they are."""
-    where, face = _closest(tree.boxes, tree.begin, tree.corners, points)
-    return where, tree.order[face]
+    tree: Tree, points: Float[np.ndarray, "n 3"], reach: float = np.inf
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"], Int[np.ndarray, " n"]]:
+    """Return the points of the mesh that are closest to points, if they are within reach (NaN: they are not).
+
+    With them go their barycentric coordinates and their triangles.
+    """
+    where, weights, face = _closest(tree.boxes, tree.begin, tree.corners, points, reach)
+    return where, weights, tree.order[face]
 
 
 OBLIQUE = np.array([0.5377667, 0.3188765, 0.7804541])  # direction in which no edge of a drawn model lies
@@ -205,11 +208,12 @@ def _weights(corner, point):
 
 
 @njit(nogil=True)
-def _closest(boxes, begins, corners, points):
-    where, face, on = np.empty((len(points), 3)), np.zeros(len(points), np.int64), np.empty(3)
+def _closest(boxes, begins, corners, points, reach):
+    where, face, on = np.full((len(points), 3), np.nan), np.zeros(len(points), np.int64), np.empty(3)
+    weights = np.full((len(points), 3), np.nan)
     stack, inner = np.empty(DEPTH, np.int64), len(begins) - 2
     for i in range(len(points)):
-        best = np.inf
+        best = reach * reach
         stack[0], count = 0, 1
         while count:
             count -= 1
@@ -232,4 +236,5 @@ def _closest(boxes, begins, corners, points):
                 if squared < best:
                     best, face[i] = squared, k
                     where[i] = on
-    return where, face
+                    weights[i, 0], weights[i, 1], weights[i, 2] = 1.0 - v - w, v, w
+    return where, weights, face

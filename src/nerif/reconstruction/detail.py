@@ -38,6 +38,7 @@ from nerif.geometry.symmetry import Axis
 from nerif.reconstruction.aperture import apply_aperture
 from nerif.reconstruction.bounds import field_bounds
 from nerif.reconstruction.device import resolve_device
+from nerif.reconstruction.gauge import with_gauge
 from nerif.reconstruction.shared_settings import SharedSettings
 from nerif.reconstruction.sources import of_source
 from nerif.reconstruction.target import Target
@@ -160,12 +161,12 @@ class Detail:
         coarse: int = 1, voxels: int | None = None,
     ) -> None:  # fmt: skip
         check_sigma(measurement)
-        measurement = apply_aperture(measurement, settings.aperture)
+        measurement = with_gauge(apply_aperture(measurement, settings.aperture), settings)
         source = getattr(settings, "source", AUTO)
         self.measurement = of_source(measurement, source, preferred="displacements")
         self.base, self.settings, self.axis, self.coarse = field, settings, axis, coarse
         self.device = resolve_device(settings.device)
-        self.layout = layout_of(self.measurement, axis, settings.ambient_faces, device=self.device)
+        self.layout = layout_of(self.measurement, axis, device=self.device)
         fine = self.layout.grid(voxels or voxels_of(self.measurement))
         self.bins = coarse * bins_of(self.measurement, fine, voxels=1.0)
         self.grid = self.layout.grid(max(1, max(fine.shape) // coarse))
@@ -174,8 +175,7 @@ class Detail:
     def problem(self) -> Problem:
         """The linear problem of the whole field."""
         target = self.target(self.measurement)
-        masked = getattr(self.settings, "hull", True) and self.measurement.flow_mask is not None
-        free = self.layout.free(self.measurement, self.grid) if masked else None
+        free = self.layout.free(self.measurement, self.grid, getattr(self.settings, "hull", True))
         bounds = field_bounds(self.measurement, self.settings.lower, self.settings.upper)
         limits = bounds if any(map(math.isfinite, bounds)) else None
         operators = [self.layout.operator(part.rays, self.grid, part.model) for part in target.parts]

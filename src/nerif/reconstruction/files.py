@@ -22,9 +22,11 @@ from nerif.data.measurement import Measurement
 from nerif.data.volume import INDEX
 from nerif.fields.base import Field
 from nerif.fields.grid import VoxelField
-from nerif.fields.network import Network, NetworkShape, NeuralField
+from nerif.fields.network import NetworkShape, NeuralField
+from nerif.fields.network_kinds import network_in
 from nerif.fields.sum import SumField
 from nerif.fields.symmetric import SymmetricNetwork, SymmetricVoxels
+from nerif.fields.walls import WallNetwork
 from nerif.forward.registry import forward_model
 from nerif.geometry import Box, Camera, Grid
 from nerif.geometry.body import Body
@@ -136,7 +138,10 @@ def _meshes(bodies: Sequence[Body]) -> dict[str, Tensor]:
 
 def read_bodies(directory: Path) -> tuple[Body, ...]:
     """Read the bodies in the flow of a result directory."""
-    tensors, about = _load(directory / FIELD)
+    return _bodies_of(*_load(directory / FIELD))
+
+
+def _bodies_of(tensors: dict[str, Tensor], about: dict[str, Any]) -> tuple[Body, ...]:
     names = about.get("bodies", ())
     return tuple(
         Body(tensors[f"{BODIES}{i}.vertices"], tensors[f"{BODIES}{i}.faces"], name) for i, name in enumerate(names)
@@ -164,6 +169,7 @@ def _entries_of(field: Field) -> tuple[dict[str, Tensor], dict[str, Any]]:
     entries = {"kind": "neural", "network": vars(field.network.shape)}
     if isinstance(field.network, SymmetricNetwork):
         entries["symmetry"] = asdict(field.network.symmetry)
+    entries |= {"walls": True} if isinstance(field.network, WallNetwork) else {}
     entries |= {"index_scale": field.scale, "offset": field.offset}
     return {k: v.detach().cpu().contiguous() for k, v in field.network.state_dict().items()}, entries
 
@@ -186,18 +192,18 @@ def read_field(directory: Path) -> tuple[Field, Box, float]:
         lower, upper = about["box"]
         box = Box(tuple(lower), tuple(upper))
         parts = {name: tensor for name, tensor in tensors.items() if not name.startswith(BODIES)}
-        return _field_of(parts, about, box), box, float(about["n_ambient"])
+        return _field_of(parts, about, box, _bodies_of(tensors, about)), box, float(about["n_ambient"])
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         raise InputError(
             f"not a field of this version of nerif ({type(error).__name__}: {error})", field=path
         ) from None
 
 
-def _field_of(tensors: dict[str, Tensor], about: dict[str, Any], box: Box) -> Field:
+def _field_of(tensors: dict[str, Tensor], about: dict[str, Any], box: Box, bodies: Sequence[Body]) -> Field:
     """The field of tensors and the entries of its header."""
     if about["kind"] == "sum":
         whole = State(tensors, {})
-        parts = [_field_of(whole.under(f"{i}."), entries, box) for i, entries in enumerate(about["parts"])]
+        parts = [_field_of(whole.under(f"{i}."), entries, box, bodies) for i, entries in enumerate(about["parts"])]
         return SumField(*parts)
     if about["kind"] == "voxels":
         return VoxelField(tensors["coefficients"], Grid(box, tuple(about["shape"])), int(about["degree"]))
@@ -207,8 +213,9 @@ def _field_of(tensors: dict[str, Tensor], about: dict[str, Any], box: Box) -> Fi
         planes = [VoxelField(c, grid, int(about["degree"])) for c in tensors["coefficients"]]
         return SymmetricVoxels(planes, Symmetry.from_entries(about["symmetry"]))
     shape = NetworkShape.of(about["network"])
-    symmetry = about.get("symmetry")
-    network = Network(shape) if symmetry is None else SymmetricNetwork(shape, Symmetry.from_entries(symmetry))
+    network = network_in(box, shape, bodies=bodies if about.get("walls") else ())
+    if "symmetry" in about:  # in network coordinates
+        network = SymmetricNetwork(shape, Symmetry.from_entries(about["symmetry"]))
     network.load_state_dict(tensors)
     network.eval().requires_grad_(False)
     return NeuralField(network, box, float(about["index_scale"]), float(about["offset"]))

@@ -1,24 +1,29 @@
-"""The gauge: regions where the field is ambient, 0, which fix the constant that displacements leave undetermined.
+"""The gauge: where the field is known, which fixes the constant that displacements leave undetermined.
 
-By default the side faces of the box and, with flow masks, the space outside the visual hull; never within a body.
+By default the field is ambient, 0, on the side faces of the box and, with flow masks, outside the visual hull; never
+within a body. A region of the box may be ambient as well, and the index may be known at single points.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerif.common.conventions import InputError
-from nerif.data.measurement import Measurement
+from nerif.data.measurement import Measurement, Region
 from nerif.geometry import Box, Grid
 from nerif.geometry.body import Body, contained
 
-__all__ = ["AmbientRegion", "ambient_faces", "check_gauge", "is_open", "visual_hull"]
+if TYPE_CHECKING:
+    from nerif.reconstruction.shared_settings import SharedSettings
+
+__all__ = ["Gauge", "ambient_faces", "check_gauge", "free_voxels", "is_open", "visual_hull", "with_gauge"]
 
 FEW = 1024  # points that show whether a region has any outside bodies
 
@@ -28,17 +33,35 @@ def is_open(measurement: Measurement) -> bool:
     return all(kind.gauge for kind in measurement.techniques)
 
 
-def ambient_faces(measurement: Measurement, faces: tuple[str, ...] = ()) -> tuple[str, ...]:
-    """Return the ambient faces: those of the settings, else those of the measurement if a technique needs a gauge."""
-    return faces or (measurement.ambient_faces if any(kind.gauge for kind in measurement.techniques) else ())
+def with_gauge(measurement: Measurement, settings: SharedSettings) -> Measurement:
+    """Return a measurement with the ambient faces and the ambient region of settings in place of its own.
+
+    Settings that state any of the two, or known points, replace both.
+    """
+    if not (settings.ambient_faces or settings.ambient_region or settings.known):
+        return measurement
+    return replace(measurement, ambient_faces=settings.ambient_faces, ambient_region=settings.ambient_region)
 
 
-def check_gauge(measurement: Measurement, faces: tuple[str, ...], hull: bool = True) -> None:
-    """Raise InputError if a constant of the field is undetermined and no region is ambient."""
-    if is_open(measurement) and not faces and not (hull and measurement.flow_mask is not None):
+def ambient_faces(measurement: Measurement) -> tuple[str, ...]:
+    """Return the ambient faces of a measurement; none if no technique needs a gauge and it has a field of its own."""
+    return measurement.ambient_faces if any(kind.gauge for kind in measurement.techniques) else ()
+
+
+def check_gauge(measurement: Measurement, known: bool = False, hull: bool = True) -> None:
+    """Raise InputError if a constant of the field is undetermined and it is known nowhere.
+
+    Parameters
+    ----------
+    known : whether it is known at points
+    hull : whether it is ambient outside the flow masks
+    """
+    faces, region = ambient_faces(measurement), measurement.ambient_region is not None
+    masks = hull and measurement.flow_mask is not None
+    if is_open(measurement) and not (faces or region or known or masks):
         raise InputError(
-            "expected at least one face (x- x+ y- y+ z- z+) or flow masks, got none; displacements "
-            "determine the index only up to a constant",
+            "expected at least one face (x- x+ y- y+ z- z+), a region, a known point or flow masks, got none; "
+            "displacements determine the index only up to a constant",
             field="ambient_faces",
         )
 
@@ -88,36 +111,61 @@ def _outside(measurement: Measurement, masks: Tensor, grid: Grid) -> Bool[Tensor
     return ~(near | visual_hull(measurement, grid))
 
 
+def free_voxels(measurement: Measurement, grid: Grid, hull: bool = True) -> Bool[Tensor, "z y x"] | None:
+    """Return the voxels whose centres are neither outside the visual hull nor in the ambient region; None for all."""
+    free = visual_hull(measurement, grid) if hull and measurement.flow_mask is not None else None
+    if measurement.ambient_region is None:
+        return free
+    lower, upper = _corners(measurement.ambient_region)
+    points = grid.points(torch.float64)
+    outside = ((points < lower) | (points > upper)).any(dim=-1)
+    return outside if free is None else free & outside
+
+
+def _corners(region: Region) -> tuple[Float[Tensor, 3], Float[Tensor, 3]]:
+    """Lower and upper corner of a region x0 x1 y0 y1 z0 z1, mm."""
+    lower, upper = torch.tensor(region, dtype=torch.float64).reshape(3, 2).unbind(dim=1)
+    return lower, upper
+
+
 @dataclass(frozen=True)
-class AmbientRegion:
-    """Faces of the box, and voxels outside the visual hull, where the index excess is 0."""
+class Gauge:
+    """Where the index excess is known: 0 on faces, outside the visual hull and in a region; at points."""
 
     box: Box
     faces: tuple[str, ...]
     empty: Float[Tensor, "m 3"]  # centres of voxels that are outside the hull with all their corners, mm
     voxel: tuple[float, float, float]  # their edges, mm
+    region: Region | None = None
+    points: Float[Tensor, "k 3"] = field(default_factory=lambda: torch.zeros(0, 3))  # mm
+    values: Float[Tensor, " k"] = field(default_factory=lambda: torch.zeros(0))  # at the points
     bodies: Sequence[Body] = ()
 
     @classmethod
-    def of(cls, measurement: Measurement, faces: tuple[str, ...], resolution: int = 48) -> AmbientRegion | None:
-        """Return the ambient region of a measurement, with the faces of the settings or its own; None if not needed."""
-        faces = ambient_faces(measurement, faces)
-        grid = Grid.of_resolution(measurement.box, resolution)
+    def of(
+        cls, measurement: Measurement, known: Sequence[tuple[float, float, float, float]] = (), resolution: int = 48
+    ) -> Gauge | None:
+        """Return the gauge of a measurement, and of known points x y z (mm) with their index; None if not needed."""
+        faces, grid = ambient_faces(measurement), Grid.of_resolution(measurement.box, resolution)
         empty = torch.zeros(0, 3)
         if measurement.flow_mask is not None:
             empty = grid.points()[_outside(measurement, _flow(measurement), grid)]
-        check_gauge(measurement, faces, bool(len(empty)))
-        if not faces and not len(empty):
+        check_gauge(measurement, bool(known), bool(len(empty)))
+        table = torch.tensor(known, dtype=torch.float64).reshape(-1, 4)
+        points, values = table[:, :3].float(), (table[:, 3] - measurement.n_ambient).float()
+        _check_points(measurement, points)
+        region = measurement.ambient_region
+        if not (faces or len(empty) or region or known):
             return None
-        region = cls(measurement.box, faces, empty, grid.spacing, measurement.bodies)
-        if not len(region.sample(FEW, torch.Generator().manual_seed(0))):
+        gauge = cls(measurement.box, faces, empty, grid.spacing, region, points, values, measurement.bodies)
+        if not len(gauge.sample(FEW, torch.Generator().manual_seed(0))[0]):
             raise InputError("expected a region outside the bodies, got none; name other faces", field="ambient_faces")
-        return region
+        return gauge
 
-    def sample(self, count: int, generator: torch.Generator) -> Float[Tensor, "n 3"]:
-        """Draw about `count` random points (mm) outside bodies, half of them outside the hull if there is one."""
-        points = []
-        share = count // 2 if len(self.empty) and self.faces else count
+    def sample(self, count: int, generator: torch.Generator) -> tuple[Float[Tensor, "n 3"], Float[Tensor, " n"]]:
+        """Draw about `count` points (mm) outside bodies, as many of each kind, and return the index excess at them."""
+        kinds = sum((bool(self.faces), len(self.empty) > 0, self.region is not None, len(self.points) > 0))
+        points, share = [], count // max(kinds, 1)
         if self.faces:
             corner, edges = self._face_frames
             unit = torch.rand(len(self.faces), -(-share // len(self.faces)), 2, generator=generator)
@@ -126,8 +174,15 @@ class AmbientRegion:
             index = torch.randint(len(self.empty), (share,), generator=generator)
             shift = (torch.rand(share, 3, generator=generator) - 0.5) * torch.tensor(self.voxel)
             points.append(self.empty[index] + shift)
-        sample = torch.cat(points)
-        return sample[~contained(self.bodies, sample)] if self.bodies else sample
+        if self.region is not None:
+            lower, upper = (corner.float() for corner in _corners(self.region))
+            points.append(lower + torch.rand(share, 3, generator=generator) * (upper - lower))
+        ambient = torch.cat(points) if points else torch.zeros(0, 3)
+        if self.bodies:
+            ambient = ambient[~contained(self.bodies, ambient)]
+        index = torch.arange(share if len(self.points) else 0) % max(len(self.points), 1)
+        known, values = self.points[index], self.values[index]
+        return torch.cat([ambient, known]), torch.cat([torch.zeros(len(ambient)), values])
 
     @cached_property
     def _face_frames(self) -> tuple[Float[Tensor, "face 1 3"], Float[Tensor, "face 2 3"]]:
@@ -135,3 +190,14 @@ class AmbientRegion:
         unit = torch.tensor([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
         points = torch.stack([self.box.face_points(face, unit) for face in self.faces])
         return points[:, :1], points[:, 1:] - points[:, :1]
+
+
+def _check_points(measurement: Measurement, points: Float[Tensor, "k 3"]) -> None:
+    """Raise InputError for a known point that is outside the box or within a body."""
+    lower, upper = measurement.box.lower, measurement.box.upper
+    outside = ((points < points.new_tensor(lower)) | (points > points.new_tensor(upper))).any(dim=-1)
+    within = contained(measurement.bodies, points)
+    for wrong, where in ((outside, f"outside the box {lower} to {upper} mm"), (within, "within a body")):
+        if bool(wrong.any()):
+            got = " ".join(f"{x:g}" for x in points[wrong][0].tolist())
+            raise InputError(f"expected points of the flow, got {got}, {where}", field="known")

@@ -73,7 +73,7 @@ class Projector:
         dtype: torch.dtype = torch.float32,
     ) -> None:  # fmt: skip
         measurement = apply_aperture(of_source(measurement, source, preferred="displacements"), aperture)
-        measurement = measurement if measurement.box == grid.box else replace(measurement, box=grid.box)
+        measurement = replace(measurement, box=grid.box, ambient_region=None)
         self.measurement, self.grid, self.dtype = measurement, grid, dtype
         self.device = resolve_device(str(device))
         faces = faces_of(measurement) if ambient_faces is None else ambient_faces

@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final, Literal
 
-from nerif.common.conventions import parse_faces
+from nerif.common.conventions import ambient_index, parse_faces
 from nerif.common.settings import NonNegative, check_settings
+from nerif.data.measurement import Region, check_region
 from nerif.geometry.symmetry import NO_SYMMETRY, parse_symmetry
 from nerif.reconstruction.base import Reconstructor
 from nerif.reconstruction.bounds import check_bounds
@@ -57,6 +58,12 @@ class SharedSettings(Reconstructor):
     """Upper bound of the field, such as 0 for the index excess of hot gas in air (default: that of the technique)."""
     ambient_faces: tuple[str, ...] = ()
     """Faces of the box with ambient index, out of x- x+ y- y+ z- z+ (default: those of the measurement)."""
+    ambient_region: Region | None = None
+    """Region with ambient index, x0 x1 y0 y1 z0 z1 in mm, such as the stream ahead of a shock; in place of the faces
+    of the measurement, unless --ambient-faces names some."""
+    known: tuple[tuple[float, float, float, float], ...] = ()
+    """Points x y z in mm with their refractive index, as 5 0 -20 1.000271; in place of the faces of the measurement,
+    too."""
     open_faces: tuple[str, ...] = ()
     """Faces through which the flow leaves the box; rays that cross them are excluded."""
     device: str = "auto"
@@ -68,4 +75,8 @@ class SharedSettings(Reconstructor):
         parse_symmetry(self.symmetry)
         check_bounds(self.lower, self.upper)
         parse_faces(self.ambient_faces)
+        if self.ambient_region is not None:
+            check_region(self.ambient_region)
+        for *_, index in self.known:
+            ambient_index(index, "known")
         parse_faces(self.open_faces, "open_faces")

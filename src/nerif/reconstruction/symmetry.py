@@ -23,7 +23,7 @@ from torch import Tensor
 from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
 from nerif.geometry.symmetry import Axis, Symmetry, parse_symmetry
-from nerif.reconstruction.gauge import ambient_faces
+from nerif.reconstruction.gauge import ambient_faces, with_gauge
 from nerif.reconstruction.gauss_newton import AdaptingField, Information
 from nerif.reconstruction.shared_settings import SharedSettings
 from nerif.reconstruction.sources import of_source
@@ -177,8 +177,8 @@ def axis_of(settings: SharedSettings, measurement: Measurement) -> Axis | None:
     sigma = (mm, math.radians(settings.axis_sigma_deg))
     if not symmetry.axial or not any(sigma):
         return Axis(symmetry, (0.0,) * 4, (0.0,) * 4, (0.0,) * 4, math.nan)
-    data = of_source(measurement, "auto", preferred="displacements")
-    faces = ambient_faces(measurement, settings.ambient_faces)
+    data = with_gauge(of_source(measurement, "auto", preferred="displacements"), settings)
+    faces = ambient_faces(data)
     return find_axis(data, symmetry, sigma, faces, settings.open_faces)
 
 

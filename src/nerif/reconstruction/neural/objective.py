@@ -57,9 +57,9 @@ class Objective:
             )  # fmt: skip
             for name, term in piece_terms.items():
                 terms[name] = terms[name] + share * term if name in terms else share * term
-        ambient = self.ambient_values(GAUGE_POINTS, self.generator)
-        if ambient is not None:
-            terms["gauge"] = ambient.square().mean()
+        errors = self.gauge_errors(GAUGE_POINTS, self.generator)
+        if errors is not None:
+            terms["gauge"] = errors.square().mean()
         return terms
 
     def ambient_term(self, batch: Batch) -> Tensor:
@@ -79,12 +79,12 @@ class Objective:
         term = self._ambient_term(parts, [part.measured.numel() for part in parts])
         return float(term) * sum(getattr(weights, name) for name in DATA_TERMS)
 
-    def ambient_values(self, count: int, generator: torch.Generator) -> Tensor | None:
-        """Return the network in full precision at points that are ambient; None if there are none."""
-        if self.data.ambient is None:
+    def gauge_errors(self, count: int, generator: torch.Generator) -> Tensor | None:
+        """Return the network in full precision less the field where it is known, 0 if ambient; None without a gauge."""
+        if self.data.gauge is None:
             return None
-        points = sent(self.data.ambient.sample(count, generator), self.data.device)
-        return self.field.network(self.field.normalise(points))
+        points, values = (sent(part, self.data.device) for part in self.data.gauge.sample(count, generator))
+        return self.field.network(self.field.normalise(points)) - values / self.field.scale
 
     @torch.no_grad()
     def withheld_residual(self, density: SamplingDensity) -> float:

@@ -132,9 +132,9 @@ class Trainer:
         if not outcome.failed:
             outcome = Outcome(outcome.reason, outcome.message + self.guard.remark + self.network.remark)
         self.field.network.eval().requires_grad_(False)
-        ambient = self.objective.ambient_values(LEVEL_POINTS, torch.Generator().manual_seed(0))
-        if ambient is not None and self.data.gauge_free and self.field.network.limits == UNBOUNDED:
-            self.field.offset = float(ambient.mean())
+        errors = self.objective.gauge_errors(LEVEL_POINTS, torch.Generator().manual_seed(0))
+        if errors is not None and self.data.gauge_free and self.field.network.limits == UNBOUNDED:
+            self.field.offset = float(errors.mean())
         return Reconstruction(
             field=self.field,
             box=self.data.box,

@@ -19,14 +19,14 @@ from torch import Tensor
 
 from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
-from nerif.fields.network import Network, NeuralField
-from nerif.fields.symmetric import SymmetricNetwork
+from nerif.fields.network import NeuralField
+from nerif.fields.network_kinds import network_in
 from nerif.forward.base import ForwardModel
 from nerif.reconstruction.aperture import apply_aperture, lens_rays
 from nerif.reconstruction.bounds import field_bounds, in_units
 from nerif.reconstruction.device import resolve_device
 from nerif.reconstruction.files import fingerprint
-from nerif.reconstruction.gauge import AmbientRegion, is_open
+from nerif.reconstruction.gauge import Gauge, is_open, with_gauge
 from nerif.reconstruction.neural.bins import coarsest_edge, withhold_pixels
 from nerif.reconstruction.neural.settings import TrainingSettings
 from nerif.reconstruction.rig.parameters import refined_groups
@@ -87,7 +87,7 @@ class TrainingData:
     ----------
     fingerprint : digest of each part of the data
     gauge_free : whether the data leave a constant of the field undetermined
-    ambient : region in which the field is ambient, or None
+    gauge : where the field is known, or None
     bounds : lowest and highest value of the field
     shape, samples : of the network; per ray at the start and at the end of a run
     lens_rays : rays per pixel at the end of a run; 1 without a lens
@@ -105,7 +105,7 @@ class TrainingData:
     def __init__(
         self, settings: TrainingSettings, measurement: Measurement, coarsest: int | None = None, withhold: bool = False
     ) -> None:
-        measurement = apply_aperture(measurement, settings.aperture)
+        measurement = with_gauge(apply_aperture(measurement, settings.aperture), settings)
         # images do not determine a shift
         preferred = "displacements" if "shift" in refined_groups(settings.refine) else "images"
         source = resolve_source(measurement, settings.source, preferred)
@@ -118,7 +118,7 @@ class TrainingData:
         self.shape, self.samples = settings.network, settings.samples
         self.settings, self.measurement = settings, measurement
         self.coarsest = coarsest_edge(measurement) if coarsest is None else coarsest
-        self.ambient = AmbientRegion.of(measurement, settings.ambient_faces)
+        self.gauge = Gauge.of(measurement, settings.known)
         self.bounds = field_bounds(measurement, settings.lower, settings.upper)
         self.axis = axis_of(settings, measurement)
         self.lens_rays = lens_rays(measurement, settings.lens_rays)
@@ -180,11 +180,8 @@ class TrainingData:
     def initial_field(self) -> NeuralField:
         """Return a field within the bounds, with random weights from torch's global generator."""
         bounds = in_units(self.bounds, self.target.scale)
-        if self.axis is None:
-            network = Network(self.shape, bounds)
-        else:
-            symmetry = self.axis.symmetry.in_units(self.box.centre, max(self.box.edges) / 2)
-            network = SymmetricNetwork(self.shape, symmetry, bounds)
+        symmetry = None if self.axis is None else self.axis.symmetry
+        network = network_in(self.box, self.shape, bounds, symmetry, self.measurement.bodies)
         return NeuralField(network.to(self.device), self.box, self.target.scale)
 
     # -- nuisance parameters: fitted besides the field, such as the brightness of images -------------------------------

@@ -104,7 +104,7 @@ def covariance(
     """
     grid = Grid.of_resolution(measurement.box, voxels or VOXELS)
     target = Target.of(measurement, open_faces, bins_of(measurement, grid), linear=True).without_outliers().to("cpu")
-    boundary = Boundary(ambient_faces(measurement, ()))
+    boundary = Boundary(ambient_faces(measurement))
     corrected = tuple(rig.of(part) for part in target.parts)
     operators = [VoxelOperator(part.rays, grid, part.model, BASIS, boundary) for part in corrected]
     problem = Problem(operators, replace(target, parts=corrected))

@@ -33,7 +33,7 @@ from nerif.reconstruction.base import OnStep, Outcome, Reconstruction, State, St
 from nerif.reconstruction.bounds import field_bounds
 from nerif.reconstruction.device import Cores, available_memory, peak_memory, resolve_device
 from nerif.reconstruction.files import check_fingerprint, fingerprint
-from nerif.reconstruction.gauge import ambient_faces, check_gauge
+from nerif.reconstruction.gauge import Gauge, check_gauge, is_open, with_gauge
 from nerif.reconstruction.neural.bins import pixel_subset
 from nerif.reconstruction.rig.refinement import MOMENTUM, Refinement, load_rig, random_pixels, rig_state
 from nerif.reconstruction.sources import of_source
@@ -56,6 +56,7 @@ REFINEMENT_WEIGHT = 0.1 * COARSE_WEIGHT  # while a rig is refined and no weight 
 ROUNDS = 20  # refinements of a rig on a level
 ROUNDS_WITHOUT_MOMENTUM = 5  # at the end of them
 ROUND_ITERATIONS = 8  # of the field after each refinement
+KNOWN_POINTS = 1 << 12  # for the constant of a field that is not pinned to the ambient index
 STATE = {
     "level": "level", "round": "round", "done": "iteration", "total": "iterations", "weight": "weight",
     "guess": "guess", "chosen": "reason", "choosing": "search_levels",
@@ -75,21 +76,20 @@ class Descent:
         start: Field | None,
     ) -> None:  # fmt: skip
         measurement = of_source(measurement, settings.source, preferred="displacements")
-        measurement = apply_aperture(measurement, settings.aperture)
+        measurement = with_gauge(apply_aperture(measurement, settings.aperture), settings)
         self.settings, self.measurement, self.on_step, self.start = settings, measurement, on_step, start
         self.device = resolve_device(settings.device)
         self.cores = Cores(self.device)
-        faces = ambient_faces(measurement, settings.ambient_faces)
-        check_gauge(measurement, faces, settings.hull)
+        check_gauge(measurement, bool(settings.known), settings.hull)
         self.axis = axis_of(settings, measurement)
         dtype = getattr(torch, settings.precision)
-        self.layout = layout_of(measurement, self.axis, faces, settings.basis, settings.step, self.device, dtype)
+        self.layout = layout_of(measurement, self.axis, settings.basis, settings.step, self.device, dtype)
         grids = self.layout.grids(settings.voxels, settings.coarse_to_fine)
         self.levels = levels(measurement, grids, settings.coarse_to_fine)
         finest = grids[-1]
         self._check_memory(finest.shape, settings.memory_bytes(measurement, finest, self.device.type))
-        masked = settings.hull and measurement.flow_mask is not None
-        self.free = self.layout.free(measurement, finest) if masked else None
+        self.free = self.layout.free(measurement, finest, settings.hull)
+        self.known = self._known()
         bounds = field_bounds(measurement, settings.lower, settings.upper)
         self.bounds = bounds if any(map(math.isfinite, bounds)) else None
         self.finest_target = self._target(self.levels[-1].edge)
@@ -123,6 +123,19 @@ class Descent:
                 f"{available / 2**30:.1f} GiB are free; give fewer --voxels than {self.settings.voxels}",
                 field="voxels",
             )
+
+    def _known(self) -> Gauge | None:
+        """Where the field is known, if that alone fixes its constant: the solution is shifted to it."""
+        pinned = self.layout.faces or (self.free is not None and not bool(self.free.all()))
+        if pinned and self.settings.known:
+            raise InputError(
+                "expected no ambient faces, region or masks beside known points for a voxel method, which shifts its "
+                "field to the points; leave one of the two out, or take --method nerif",
+                field="known",
+            )
+        if pinned or not is_open(self.measurement):
+            return None
+        return Gauge.of(self.measurement, self.settings.known)
 
     # -- levels ----------------------------------------------------------------------------------------------------
 
@@ -203,7 +216,12 @@ class Descent:
     def _field(self, level: Level) -> Field:
         """The field of the present solution, on the grid of the level."""
         assert self.x is not None
-        return self.layout.field(self.x * self.scale, level.grid)
+        coefficients = self.x * self.scale
+        if self.known is not None:
+            points, values = self.known.sample(KNOWN_POINTS, torch.Generator().manual_seed(0))
+            field = self.layout.field(coefficients.cpu(), level.grid)
+            coefficients = coefficients + float((values - field(points)).mean())
+        return self.layout.field(coefficients, level.grid)
 
     def _target(self, edge: int, measurement: Measurement | None = None) -> Target:
         settings, measurement = self.settings, measurement or self.measurement

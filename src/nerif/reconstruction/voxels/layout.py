@@ -18,7 +18,7 @@ from nerif.fields.symmetric import SymmetricVoxels
 from nerif.forward.base import ForwardModel
 from nerif.geometry import Box, Grid, Rays
 from nerif.geometry.symmetry import Axis, Symmetry
-from nerif.reconstruction.gauge import ambient_faces, visual_hull
+from nerif.reconstruction.gauge import ambient_faces, free_voxels
 from nerif.reconstruction.voxels.operator import VoxelOperator
 from nerif.reconstruction.voxels.symmetric_operator import SymmetricOperator
 
@@ -71,8 +71,8 @@ class Layout(ABC):
         return (0, 1, 2)
 
     @abstractmethod
-    def free(self, measurement: Measurement, grid: Grid) -> Bool[Tensor, "z y x"]:
-        """Return the coefficients within the visual hull."""
+    def free(self, measurement: Measurement, grid: Grid, hull: bool = True) -> Bool[Tensor, "z y x"] | None:
+        """Return the coefficients outside the ambient region and, with `hull`, within the hull; None for all."""
 
     def grids(self, voxels: int, coarse_to_fine: bool) -> list[Grid]:
         """Return grids from coarse to fine, the voxels halved from each to the next, or the last alone."""
@@ -85,11 +85,11 @@ class Layout(ABC):
 
 
 def layout_of(
-    measurement: Measurement, axis: Axis | None, faces: tuple[str, ...] = (), basis: str = "cubic",
-    step: float | None = None, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32,
+    measurement: Measurement, axis: Axis | None, basis: str = "cubic", step: float | None = None,
+    device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32,
 ) -> Layout:  # fmt: skip
-    """Return the layout for a measurement, with the ambient faces of the settings or else its own."""
-    faces = ambient_faces(measurement, faces)
+    """Return the layout for a measurement."""
+    faces = ambient_faces(measurement)
     common: dict[str, Any] = {"box": measurement.box, "faces": faces, "basis": basis, "step": step}
     common |= {"device": device, "dtype": dtype}
     return Symmetric(symmetry=axis.symmetry, **common) if axis else InSpace(**common)
@@ -116,8 +116,8 @@ class InSpace(Layout):
     def sample(self, field: Field, grid: Grid) -> Float[Tensor, "z y x"]:
         return field.sample(grid, self.device)
 
-    def free(self, measurement: Measurement, grid: Grid) -> Bool[Tensor, "z y x"]:
-        return visual_hull(measurement, grid)
+    def free(self, measurement: Measurement, grid: Grid, hull: bool = True) -> Bool[Tensor, "z y x"] | None:
+        return free_voxels(measurement, grid, hull)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -164,10 +164,13 @@ class Symmetric(Layout):
         points = self.symmetry.places(r, angle, h).float()
         return field.to("cpu")(points.reshape(-1, 3)).detach().reshape(points.shape[:-1])
 
-    def free(self, measurement: Measurement, grid: Grid) -> Bool[Tensor, "z k x"]:
-        """Return the rings of which most lies within the hull, and those that the grid in space does not sample."""
+    def free(self, measurement: Measurement, grid: Grid, hull: bool = True) -> Bool[Tensor, "z k x"] | None:
+        """Return the rings most of which is free, and those that the grid in space does not sample; None for all."""
         space = Grid.of_resolution(self.box, round(max(self.box.edges) / min(grid.spacing)))
-        inside = visual_hull(measurement, space).flatten()
+        free_in_space = free_voxels(measurement, space, hull)
+        if free_in_space is None:
+            return None
+        inside = free_in_space.flatten()
         place = self.symmetry.reduced(space.points(torch.float64).reshape(-1, 3))
         box, (nz, angles, nx) = grid.box, grid.shape
         r = ((place[:, 0] - box.lower[0]) / grid.spacing[0]).floor().long()

@@ -20,12 +20,14 @@ from nerif.common.conventions import InputError
 from nerif.common.files import atomic
 from nerif.common.netcdf import reading
 from nerif.data.kinds import SEQUENCE_KIND, SEQUENCE_RESULT, check_kind
+from nerif.data.measurement_file import BODIES, bodies_of
 from nerif.data.measurement_sequence import MeasurementSequence, add_frames, check_store
 from nerif.data.volume import Volume
 from nerif.data.volume_sequence import FIELDS, VolumeSequence, score_names
 from nerif.fields.network import Network, NetworkShape, NeuralField
-from nerif.fields.symmetric import SymmetricNetwork
+from nerif.fields.network_kinds import network_in
 from nerif.geometry import Box, Grid
+from nerif.geometry.body import Body
 from nerif.geometry.symmetry import Symmetry
 from nerif.reconstruction.bounds import in_units
 
@@ -93,7 +95,10 @@ class SequenceStore(VolumeSequence):
         }
         with atomic(path) as part:
             group = VolumeSequence.create(part, sequence.times, grid, quantities, like.n_ambient, about).group
-            views, parameters = len(like.names), sum(p.numel() for p in _network(about, grid.box).parameters())
+            views, parameters = (
+                len(like.names),
+                sum(p.numel() for p in _network(about, grid.box, bodies=like.bodies).parameters()),
+            )
 
             def add(name: str, kind: str, fill: float | str, meaning: str, **more: Any) -> None:
                 add_frames(group, name, frames, (), (), kind, fill, long_name=meaning, **more)
@@ -104,6 +109,10 @@ class SequenceStore(VolumeSequence):
                 add_frames(group, cc, frames, *per_view, units="1", long_name=f"correlation of {of}")
                 add_frames(group, rms, frames, *per_view, units=kind.unit, long_name=f"rms difference of {of}")
             add_frames(group, "weights", frames, (parameters,), ("parameter",), "float32", long_name="of the network")
+            for name, array in sequence.body_arrays().items():
+                group.create_array(
+                    name, data=array.values, dimension_names=list(map(str, array.dims)), attributes=array.attrs
+                )
             add("index_scale", "float64", nan, "field of one unit of network output")
             add("offset", "float64", nan, "network output of the ambient field")
             add("seconds", "float64", nan, "duration of the frame, s")  # as units: xarray would read a time span
@@ -121,6 +130,14 @@ class SequenceStore(VolumeSequence):
         """Symmetry of the fields of all frames, mm, if any."""
         entries = self.attributes.get("symmetry")
         return Symmetry.from_entries(entries) if entries else None
+
+    def bodies(self, index: int) -> tuple[Body, ...]:
+        """Return the bodies in the flow of a frame."""
+        arrays = {name: self.array(name) for name in BODIES if name in self.group}
+        if not arrays:
+            return ()
+        moving = {name for name, array in arrays.items() if array.metadata.dimension_names[0] == "time"}
+        return bodies_of({name: self.read(name, index if name in moving else slice(None)) for name in arrays})
 
     @property
     def status(self) -> np.ndarray:
@@ -166,7 +183,9 @@ class SequenceStore(VolumeSequence):
         if int(self.read("status", index)) != DONE:
             raise InputError(f"frame {index} is not done; run nerif sequence again for missing frames", field=self.path)
         with reading(f"{self.path}: made by another version of nerif, or damaged; reconstruct it again"):
-            network = _network(self.attributes, self.grid.box, float(self.read("index_scale", index)))
+            network = _network(
+                self.attributes, self.grid.box, float(self.read("index_scale", index)), self.bodies(index)
+            )
         weights = torch.from_numpy(self.read("weights", index))
         scale, offset = (float(self.read(name, index)) for name in ("index_scale", "offset"))
         if len(weights) != sum(p.numel() for p in network.parameters()) or not bool(torch.isfinite(weights).all()):
@@ -196,12 +215,10 @@ class SequenceStore(VolumeSequence):
                 )
 
 
-def _network(attributes: dict[str, Any], box: Box, scale: float = 1.0) -> Network:
+def _network(attributes: dict[str, Any], box: Box, scale: float = 1.0, bodies: Sequence[Body] = ()) -> Network:
     """Return a network of the shape, symmetry and bounds of a store, for a field in units of `scale`."""
     shape = NetworkShape.of(attributes["network"])
     low, high = attributes.get("bounds", (None, None))  # no infinity in JSON
     bounds = in_units((-math.inf if low is None else low, math.inf if high is None else high), scale)
-    if attributes.get("symmetry"):
-        symmetry = Symmetry.from_entries(attributes["symmetry"]).in_units(box.centre, max(box.edges) / 2)
-        return SymmetricNetwork(shape, symmetry, bounds)
-    return Network(shape, bounds=bounds)
+    symmetry = Symmetry.from_entries(attributes["symmetry"]) if attributes.get("symmetry") else None
+    return network_in(box, shape, bounds, symmetry, bodies)

@@ -1,0 +1,33 @@
+"""The kind of network for a flow: plain, symmetric, or with the walls of bodies."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from nerif.fields.network import UNBOUNDED, Network, NetworkShape
+from nerif.fields.symmetric import SymmetricNetwork
+from nerif.fields.walls import WallNetwork
+from nerif.geometry import Box
+from nerif.geometry.body import Body
+from nerif.geometry.symmetry import Symmetry
+
+__all__ = ["network_in"]
+
+
+def network_in(
+    box: Box, shape: NetworkShape, bounds: tuple[float, float] = UNBOUNDED, symmetry: Symmetry | None = None,
+    bodies: Sequence[Body] = (),
+) -> Network:  # fmt: skip
+    """Return a network with random weights from torch's global generator, for a field in a box.
+
+    Parameters
+    ----------
+    bounds : in network units
+    symmetry, bodies : in mm; a symmetric network has no walls
+    """
+    unit = max(box.edges) / 2
+    if symmetry is not None:
+        return SymmetricNetwork(shape, symmetry.in_units(box.centre, unit), bounds)
+    if bodies:
+        return WallNetwork(shape, [body.in_units(box.centre, unit) for body in bodies], bounds)
+    return Network(shape, bounds)
