@@ -9,10 +9,12 @@ from typing import Any
 
 import pytest
 import torch
+import trimesh
 
 from app.serving import opened
 from app.test_pages import line, put
 from app.test_results import pick
+from bodies import ball
 from nerif.analysis.consistency_file import read_findings
 from nerif.app.jobs import Job, Jobs
 from nerif.app.mask_editor import Brush
@@ -260,3 +262,17 @@ def test_the_brush_grows_by_a_quarter_within_the_image(width, larger, expected):
     brush = Brush(width=width)
     brush.resize(larger, 100)
     assert brush.width == expected
+
+
+@pytest.mark.slow
+def test_a_model_is_added(browser, server, folder):
+    body = ball(6.0)
+    trimesh.Trimesh(body.vertices.numpy(), body.faces.numpy(), process=False).export(folder / "ball.stl")
+    opened(browser, server, "check", LINE)
+    click(browser, "Add the model")
+    (added,) = written(folder / "bad.body.nc").bodies
+    assert added.name == "ball"
+    wait_for(browser, 'return document.querySelector(\'[alt^="Outlines"] img, img[alt^="Outlines"]\') !== null', 30)
+    for name in ("ball.stl", "bad.body.nc", "bad.body.bodies.png"):
+        (folder / name).unlink()
+    assert errors(browser) == []

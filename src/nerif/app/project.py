@@ -10,6 +10,7 @@ from typing import TypeVar
 
 from nerif.common.conventions import InputError
 from nerif.common.files import ending
+from nerif.data.body_file import FORMATS
 from nerif.data.kinds import VOLUME, kind_of
 from nerif.imaging.readers.views import View, find_views
 from nerif.results.directory import LIVE, RUN
@@ -35,6 +36,7 @@ class Contents:
     volumes : volume files (.nc, .vti) outside of result directories
     results : result directories, also of current runs
     films : stores over time (.zarr)
+    models : surfaces of bodies (.stl, .obj, .ply)
     unread : paths that could not be read, with the cause
     """
 
@@ -44,6 +46,7 @@ class Contents:
     volumes: tuple[str, ...] = ()
     results: tuple[str, ...] = ()
     films: tuple[str, ...] = ()
+    models: tuple[str, ...] = ()
     unread: tuple[tuple[str, str], ...] = ()
 
 
@@ -156,6 +159,8 @@ class Project:
             if ending(path) == ".zarr":
                 return "films"
             return "results" if _is_result(path) else "experiments" if _has_views(path) else ""
+        if ending(path) in FORMATS:
+            return "models"
         if ending(path) == ".toml":
             return "calibrations" if self.from_cache(self.relative(path), "kind", _is_calibration) else ""
         named = ending(path) == ".nc" and path.name != "reprojection.nc"

@@ -66,6 +66,10 @@ class Workspace:
         """Return the measurement files as they are now."""
         return (await self.contents()).measurements
 
+    async def models(self) -> tuple[str, ...]:
+        """Return the surfaces of bodies as they are now."""
+        return (await self.contents()).models
+
     async def in_thread(self, work: Callable[P, T], *arguments: P.args, **keywords: P.kwargs) -> T:
         """Run blocking work in a thread, so that pages stay responsive."""
         return await asyncio.to_thread(work, *arguments, **keywords)

@@ -28,7 +28,7 @@ from nerif.geometry.plausibility import background_cuts, likely_cause, rays_on_l
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["MASKS", "Measurement", "Observation", "Region", "check_region", "integrals_of", "measurement_of"]
+__all__ = ["MASKS", "Measurement", "Observation", "check_region", "integrals_of", "measurement_of"]
 
 MASKS = ("valid", "flow_mask", "hidden")
 """Fields of a measurement that are masks (view, row, column)."""

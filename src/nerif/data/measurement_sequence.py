@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     import numpy as np
     import xarray as xr
     import zarr
+    from torch import Tensor
 
 __all__ = ["ZARR_FORMAT", "MeasurementSequence", "add_frames", "check_store", "require_zarr"]
 
@@ -183,9 +184,13 @@ class MeasurementSequence:
 
     @classmethod
     def create(
-        cls, path: str | os.PathLike[str], times: Sequence[float], like: Measurement, force: bool = False
-    ) -> MeasurementSequence:
-        """Make a store for frames with the cameras, box and optional variables of `like`, without data yet."""
+        cls, path: str | os.PathLike[str], times: Sequence[float], like: Measurement, force: bool = False,
+        moving: bool = False,
+    ) -> MeasurementSequence:  # fmt: skip
+        """Make a store for frames with the cameras, box and optional variables of `like`, without data yet.
+
+        With `moving`, its bodies have a pose in each frame.
+        """
         import numpy as np
         import zarr
 
@@ -209,12 +214,23 @@ class MeasurementSequence:
                 v = dataset[name]
                 fill = np.nan if v.dtype.kind == "f" else 0
                 add_frames(group, name, len(times), v.shape, tuple(map(str, v.dims)), v.dtype, fill, **v.attrs)
+            for name in ("body_rotation", "body_translation") if moving else ():
+                dimensions, unit = variables()[name]
+                sizes = (len(like.bodies), *(3 for _ in dimensions[1:]))
+                add_frames(group, name, len(times), sizes, dimensions, "float64", units=unit)
             meaning = "written last: the frame is complete"
             add_frames(group, WRITTEN, len(times), (), (), "int8", 0, long_name=meaning)
         return cls(path, tuple(float(t) for t in times))
 
-    def write_frame(self, index: int, measurement: Measurement) -> None:
-        """Write one frame, `written` last; views that the measurement lacks have no data then."""
+    def write_frame(
+        self, index: int, measurement: Measurement, poses: Sequence[tuple[Tensor, Tensor]] | None = None
+    ) -> None:
+        """Write one frame, `written` last; views that the measurement lacks have no data then.
+
+        Parameters
+        ----------
+        poses : rotation and translation (mm) of each moving body
+        """
         import numpy as np
         import zarr
 
@@ -236,6 +252,9 @@ class MeasurementSequence:
             whole = np.full(group[name].shape[1:], group[name].fill_value, dtype=array.dtype)
             whole[views, : array.shape[1], : array.shape[2]] = array
             group[name][index] = whole
+        if poses is not None:
+            for name, values_of in zip(("body_rotation", "body_translation"), zip(*poses, strict=True), strict=True):
+                group[name][index] = np.stack([value.numpy() for value in values_of])
         if WRITTEN in group:
             group[WRITTEN][index] = 1
 

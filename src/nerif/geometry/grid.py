@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -47,6 +48,15 @@ class Box:
         if (lower is None) != (upper is None):
             raise InputError("expected both corners of the box or neither", field="lower, upper")
         return None if lower is None or upper is None else cls(lower, upper)
+
+    def grown(self, faces: Sequence[str], length: float) -> Box:
+        """Return the box with faces such as "z+" moved outwards by a length, mm."""
+        corners = [list(self.lower), list(self.upper)]
+        for face in faces:
+            axis, side = "xyz".index(face[0]), face[1] == "+"
+            corners[side][axis] += length if side else -length
+        (x0, y0, z0), (x1, y1, z1) = corners
+        return Box((x0, y0, z0), (x1, y1, z1))
 
     @property
     def edges(self) -> tuple[float, float, float]:

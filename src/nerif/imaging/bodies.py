@@ -1,17 +1,25 @@
-"""Bodies in a measurement: the pixels that they hide, and whether the data agree with their place."""
+"""Bodies in a measurement or a film: the pixels that they hide, and whether the data agree with their place."""
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import torch
+from torch import Tensor
 
 from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
+from nerif.data.measurement_sequence import MeasurementSequence
 from nerif.geometry.body import Body, check_place, hidden_pixels, orientations
+from nerif.geometry.pose import rotation_matrix
+from nerif.imaging.silhouettes import refine_pose
 
-__all__ = ["with_bodies", "without_bodies"]
+__all__ = ["film_with_bodies", "read_poses", "with_bodies", "without_bodies"]
+
+POSE_COLUMNS = ("rx", "ry", "rz", "tx", "ty", "tz")
 
 FITS, FITS_NOT = 0.7, 0.4  # overlap of hidden pixels and those without data, of which one place is taken for another
 COMPARED = 48  # pixels along an image that are compared
@@ -53,6 +61,74 @@ def with_bodies(
     values = {o.technique.name: o.values.masked_fill(hidden[..., None], torch.nan) for o in measurement.observations}
     sigmas = {o.technique.name: o.sigma for o in measurement.observations}
     return replace(measurement.observed(values, sigmas), bodies=tuple(bodies), hidden=hidden)
+
+
+Pose = tuple[Tensor, Tensor]
+"""R (3, 3) and t (3,) in mm of x_world = R x_model + t."""
+
+
+def read_poses(path: Path, bodies: int, frames: int) -> list[list[Pose]]:
+    """Read the poses of bodies in each frame of a film from a table (.csv).
+
+    Its columns are rx, ry, rz (axis of the rotation times its angle, degrees) and tx, ty, tz (mm), one row for
+    each frame; with several bodies one row for each body of each frame in turn.
+    """
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            rows = [[float(row[name]) for name in POSE_COLUMNS] for row in csv.DictReader(file)]
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(
+            f"expected a table with the columns {', '.join(POSE_COLUMNS)} and numbers in them, got an error at {error}",
+            field=path,
+        ) from None
+    except OSError as error:
+        raise InputError(f"cannot be read ({error})", field=path) from None
+    if len(rows) != bodies * frames:
+        raise InputError(f"expected {bodies * frames} rows for {frames} frames, got {len(rows)}", field=path)
+    table = torch.tensor(rows, dtype=torch.float64).reshape(frames, bodies, 6)
+    rotations = rotation_matrix(table[..., :3].deg2rad())
+    return [[(r, t) for r, t in zip(*frame, strict=True)] for frame in zip(rotations, table[..., 3:], strict=True)]
+
+
+def film_with_bodies(
+    film: MeasurementSequence, out: Path, bodies: Sequence[Body], poses: Sequence[Sequence[Pose]] | None = None,
+    margin: int = 0, unit_stated: bool = False, refine: bool = False, force: bool = False,
+    on_frame: Callable[[int, int], object] = lambda done, count: None,
+) -> MeasurementSequence:  # fmt: skip
+    """Write a film with bodies, at rest or moving; in each frame, pixels that see one have no data.
+
+    Parameters
+    ----------
+    poses : of each frame and body
+    refine : whether the pose in each frame is that of the outline of its pixels without data; it starts from the frame
+        before
+    on_frame : called with the numbers of frames done and of all
+    """
+    whole: MeasurementSequence | None = None
+    moving, last = poses is not None or refine, list(bodies)
+    for index in range(len(film)):
+        frame = film.frame(index)
+        here = [b.moved(*pose) for b, pose in zip(bodies, poses[index], strict=True)] if poses is not None else last
+        if refine:
+            here = [refine_pose(frame, body, margin=margin).body for body in here]
+        last = here
+        frame = with_bodies(frame, here, margin, unit_stated)
+        if whole is None:
+            at_rest = replace(frame, bodies=tuple(bodies))
+            whole = MeasurementSequence.create(out, film.times, at_rest, force, moving)
+        whole.write_frame(index, frame, [_pose(a, b) for a, b in zip(bodies, here, strict=True)] if moving else None)
+        on_frame(index + 1, len(film))
+    assert whole is not None
+    return whole
+
+
+def _pose(rest: Body, moved: Body) -> Pose:
+    """The pose that takes a body from rest to where it is (Kabsch)."""
+    a, b = (body.vertices - body.vertices.mean(dim=0) for body in (rest, moved))
+    u, _, v = torch.linalg.svd(a.T @ b)
+    sign = torch.tensor([1.0, 1.0, float(torch.linalg.det(u @ v).sign())], dtype=a.dtype)
+    rotation = (v.T * sign) @ u.T
+    return rotation, moved.vertices.mean(dim=0) - rotation @ rest.vertices.mean(dim=0)
 
 
 def without_bodies(measurement: Measurement) -> Measurement:

@@ -125,7 +125,19 @@ def write_field(directory: Path, result: Reconstruction) -> None:
         about["bodies"] = [body.name for body in result.bodies]
     tensors, entries = _entries_of(result.field)
     tensors |= _meshes(result.bodies)
+    domain = _domain(result.field)
+    if domain is not None and domain != result.box:
+        about["domain"] = [domain.lower, domain.upper]
     _save(directory / FIELD, tensors, {**about, "box": [result.box.lower, result.box.upper], **entries})
+
+
+def _domain(field: Field) -> Box | None:
+    """The box for which a field was made; None for splines of (r, h)."""
+    if isinstance(field, SumField):
+        return _domain(field.parts[0])
+    if isinstance(field, NeuralField):
+        return field.box
+    return field.grid.box if isinstance(field, VoxelField) else None
 
 
 def _meshes(bodies: Sequence[Body]) -> dict[str, Tensor]:
@@ -192,7 +204,9 @@ def read_field(directory: Path) -> tuple[Field, Box, float]:
         lower, upper = about["box"]
         box = Box(tuple(lower), tuple(upper))
         parts = {name: tensor for name, tensor in tensors.items() if not name.startswith(BODIES)}
-        return _field_of(parts, about, box, _bodies_of(tensors, about)), box, float(about["n_ambient"])
+        lower, upper = about.get("domain", about["box"])
+        domain = Box(tuple(lower), tuple(upper))
+        return _field_of(parts, about, domain, _bodies_of(tensors, about)), box, float(about["n_ambient"])
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         raise InputError(
             f"not a field of this version of nerif ({type(error).__name__}: {error})", field=path

@@ -1,7 +1,7 @@
 """The gauge: where the field is known, which fixes the constant that displacements leave undetermined.
 
 By default the field is ambient, 0, on the side faces of the box and, with flow masks, outside the visual hull; never
-within a body. A region of the box may be ambient as well, and the index may be known at single points.
+within a body. A region of the box may be ambient as well, and the index may be known at single points, by probes.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ def is_open(measurement: Measurement) -> bool:
 def with_gauge(measurement: Measurement, settings: SharedSettings) -> Measurement:
     """Return a measurement with the ambient faces and the ambient region of settings in place of its own.
 
-    Settings that state any of the two, or known points, replace both.
+    Settings that state any of the two, or probes, replace both.
     """
-    if not (settings.ambient_faces or settings.ambient_region or settings.known):
+    if not (settings.ambient_faces or settings.ambient_region or settings.probes):
         return measurement
     return replace(measurement, ambient_faces=settings.ambient_faces, ambient_region=settings.ambient_region)
 
@@ -48,19 +48,19 @@ def ambient_faces(measurement: Measurement) -> tuple[str, ...]:
     return measurement.ambient_faces if any(kind.gauge for kind in measurement.techniques) else ()
 
 
-def check_gauge(measurement: Measurement, known: bool = False, hull: bool = True) -> None:
+def check_gauge(measurement: Measurement, probes: bool = False, hull: bool = True) -> None:
     """Raise InputError if a constant of the field is undetermined and it is known nowhere.
 
     Parameters
     ----------
-    known : whether it is known at points
+    probes : whether it is known at points
     hull : whether it is ambient outside the flow masks
     """
     faces, region = ambient_faces(measurement), measurement.ambient_region is not None
     masks = hull and measurement.flow_mask is not None
-    if is_open(measurement) and not (faces or region or known or masks):
+    if is_open(measurement) and not (faces or region or probes or masks):
         raise InputError(
-            "expected at least one face (x- x+ y- y+ z- z+), a region, a known point or flow masks, got none; "
+            "expected at least one face (x- x+ y- y+ z- z+), a region, a probe or flow masks, got none; "
             "displacements determine the index only up to a constant",
             field="ambient_faces",
         )
@@ -143,19 +143,19 @@ class Gauge:
 
     @classmethod
     def of(
-        cls, measurement: Measurement, known: Sequence[tuple[float, float, float, float]] = (), resolution: int = 48
+        cls, measurement: Measurement, probes: Sequence[tuple[float, float, float, float]] = (), resolution: int = 48
     ) -> Gauge | None:
-        """Return the gauge of a measurement, and of known points x y z (mm) with their index; None if not needed."""
+        """Return the gauge of a measurement, and of probes x y z (mm) with the index there; None if not needed."""
         faces, grid = ambient_faces(measurement), Grid.of_resolution(measurement.box, resolution)
         empty = torch.zeros(0, 3)
         if measurement.flow_mask is not None:
             empty = grid.points()[_outside(measurement, _flow(measurement), grid)]
-        check_gauge(measurement, bool(known), bool(len(empty)))
-        table = torch.tensor(known, dtype=torch.float64).reshape(-1, 4)
+        check_gauge(measurement, bool(probes), bool(len(empty)))
+        table = torch.tensor(probes, dtype=torch.float64).reshape(-1, 4)
         points, values = table[:, :3].float(), (table[:, 3] - measurement.n_ambient).float()
         _check_points(measurement, points)
         region = measurement.ambient_region
-        if not (faces or len(empty) or region or known):
+        if not (faces or len(empty) or region or probes):
             return None
         gauge = cls(measurement.box, faces, empty, grid.spacing, region, points, values, measurement.bodies)
         if not len(gauge.sample(FEW, torch.Generator().manual_seed(0))[0]):
@@ -181,8 +181,8 @@ class Gauge:
         if self.bodies:
             ambient = ambient[~contained(self.bodies, ambient)]
         index = torch.arange(share if len(self.points) else 0) % max(len(self.points), 1)
-        known, values = self.points[index], self.values[index]
-        return torch.cat([ambient, known]), torch.cat([torch.zeros(len(ambient)), values])
+        values = self.values[index]
+        return torch.cat([ambient, self.points[index]]), torch.cat([torch.zeros(len(ambient)), values])
 
     @cached_property
     def _face_frames(self) -> tuple[Float[Tensor, "face 1 3"], Float[Tensor, "face 2 3"]]:
@@ -193,11 +193,11 @@ class Gauge:
 
 
 def _check_points(measurement: Measurement, points: Float[Tensor, "k 3"]) -> None:
-    """Raise InputError for a known point that is outside the box or within a body."""
+    """Raise InputError for a probe that is outside the box or within a body."""
     lower, upper = measurement.box.lower, measurement.box.upper
     outside = ((points < points.new_tensor(lower)) | (points > points.new_tensor(upper))).any(dim=-1)
     within = contained(measurement.bodies, points)
     for wrong, where in ((outside, f"outside the box {lower} to {upper} mm"), (within, "within a body")):
         if bool(wrong.any()):
             got = " ".join(f"{x:g}" for x in points[wrong][0].tolist())
-            raise InputError(f"expected points of the flow, got {got}, {where}", field="known")
+            raise InputError(f"expected points of the flow, got {got}, {where}", field="probes")

@@ -14,10 +14,11 @@ from nerif.analysis.asymmetry import halved
 from nerif.analysis.gains import fit_gains, with_gains
 from nerif.analysis.prediction import check_sees
 from nerif.common.conventions import InputError
-from nerif.common.settings import check_settings
+from nerif.common.settings import NonNegative, check_settings
 from nerif.data.measurement import Measurement
 from nerif.data.volume import Volume, quantities_of
 from nerif.fields.base import Field
+from nerif.geometry import Box
 from nerif.physics.quantities import GasSettings
 from nerif.reconstruction.aperture import apply_aperture
 from nerif.reconstruction.base import VOXELS, OnStep, Reconstruction, Reconstructor, State, Step
@@ -32,6 +33,7 @@ from nerif.reconstruction.shared_settings import SharedSettings
 from nerif.reconstruction.sources import check_source
 from nerif.reconstruction.symmetry import axis_of, with_axis
 from nerif.reconstruction.uncertainty.bootstrap import KINDS, Trials
+from nerif.reconstruction.voxels.settings import VoxelReconstructor
 from nerif.results.directory import ResultDirectory
 from nerif.results.live import Live
 from nerif.results.metrics import DetailEntries
@@ -50,6 +52,9 @@ class Run:
     view, in a short run from which the run with all views starts); or none."""
     start_from: Path | None = None
     """Result directory with the initial field: a reconstruction by any method in the same box."""
+    grow: NonNegative = 0.0
+    """Millimetres by which the box grows through the open faces (--open-faces) while the field is solved for: rays
+    through them are kept. The result is that of the box alone (0: rays through open faces are left out)."""
     fit_gains: bool = False
     """For emission: fit the intensity gain of each camera (not of withheld views)."""
     detail: Literal["auto", "on", "off"] = "auto"
@@ -94,6 +99,7 @@ class Inputs:
     withheld : names of the other views
     gains : intensity gains by view
     path : of the measurement; None for one in memory
+    box : of the result; that of the data may be larger (grow)
     """
 
     all_views: Measurement
@@ -102,6 +108,7 @@ class Inputs:
     withheld: tuple[str, ...]
     gains: dict[str, float]
     path: Path | None
+    box: Box
 
     @classmethod
     def of(
@@ -111,6 +118,9 @@ class Inputs:
         path = None if isinstance(measurement, Measurement) else Path(measurement)
         if not isinstance(measurement, Measurement):
             measurement = Measurement.read(measurement)
+        box = measurement.box
+        if run.grow:
+            measurement, reconstructor = grown(measurement, reconstructor, run.grow)
         all_views = apply_aperture(measurement, reconstructor.aperture)
         check_source(reconstructor.source, all_views)  # before any view is withheld
         measurement, reconstructor, withheld = with_halves(run.withhold, all_views, reconstructor)
@@ -118,7 +128,7 @@ class Inputs:
         gains = fit_gains(training) if run.fit_gains else {}
         if gains:
             measurement, training = with_gains(measurement, gains), with_gains(training, gains)
-        return cls(all_views, measurement, training, withheld, gains, path), reconstructor
+        return cls(all_views, measurement, training, withheld, gains, path, box), reconstructor
 
     @property
     def remarks(self) -> list[str]:
@@ -137,6 +147,20 @@ class Inputs:
                     "invertible; calibrate it with target images that cover its corners"
                 )
         return lines
+
+
+def grown(measurement: Measurement, reconstructor: Reconstructor, length: float) -> tuple[Measurement, Reconstructor]:
+    """Return a measurement whose box has grown through the open faces of settings (mm), and settings without them."""
+    faces = reconstructor.open_faces if isinstance(reconstructor, SharedSettings) else ()
+    if not faces:
+        raise InputError("expected open faces through which the box grows (--open-faces), got none", field="grow")
+    box = measurement.box.grown(faces, length)
+    changes: dict[str, Any] = {"open_faces": ()}
+    if isinstance(reconstructor, VoxelReconstructor):  # of the same size
+        changes["voxels"] = round(reconstructor.voxels * max(box.edges) / max(measurement.box.edges))
+    ambient = tuple(face for face in measurement.ambient_faces if face not in faces)
+    measurement = replace(measurement, box=box, ambient_faces=ambient)
+    return measurement, replace(reconstructor, **changes)  # type: ignore[type-var]
 
 
 class Job:
@@ -166,9 +190,10 @@ class Job:
         live: bool = False, since: float | None = None,
     ) -> None:  # fmt: skip
         self.out, self.resume, self.on_step = out, resume, on_step
+        self.stated = reconstructor
         self.inputs, self.reconstructor = Inputs.of(measurement, reconstructor, run)
         if voxels is None:
-            voxels = getattr(reconstructor, "voxels", VOXELS)
+            voxels = getattr(self.stated, "voxels", VOXELS)
         if voxels < 1:
             raise InputError(f"expected 1 or more, got {voxels}", field="voxels")
         self.voxels, self.trials = voxels, Trials(run.uncertainty)
@@ -243,10 +268,11 @@ class Job:
         directory = ResultDirectory(path)
         start, box, _ = directory.field()
         check_sees(measurement.techniques, directory.quantity(), f"start_from {path}")
-        if box != measurement.box:
+        expected = self.inputs.box
+        if box != expected:
             raise InputError(
                 f"expected a reconstruction in the box of the measurement, "
-                f"{measurement.box.lower} to {measurement.box.upper} mm, got {box.lower} to {box.upper}",
+                f"{expected.lower} to {expected.upper} mm, got {box.lower} to {box.upper}",
                 field=path,
             )
         return start
@@ -255,6 +281,9 @@ class Job:
         """Return the settings that repeat the run, by the names of the options."""
         run, reconstructor, path = self.run, self.reconstructor, self.inputs.path
         settings: dict[str, Any] = {**keep, **asdict(run), **asdict(reconstructor)}  # type: ignore[call-overload]
+        if run.grow:
+            stated = asdict(self.stated)  # type: ignore[call-overload]
+            settings |= {name: stated[name] for name in ("open_faces", "voxels") if name in stated}
         if run.start_from is not None:
             settings["start_from"] = run.start_from.resolve()
         if "density" not in quantities_of(self.measurement.quantity):

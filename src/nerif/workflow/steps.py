@@ -154,7 +154,8 @@ class Fit(PipelineStep):
             initial = job.initial if job.state is None else None
             trials = 0 if job.detail is not None and job.detail.blurred else job.trials.members
             method = job.budget.allot(job.method, 1 / (1 + trials))
-            job.result = method(job.inputs.training, compose(*callbacks), job.state, initial)
+            result = method(job.inputs.training, compose(*callbacks), job.state, initial)
+            job.result = replace(result, box=job.inputs.box)
 
 
 class AddDetail(PipelineStep):

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 from nicegui import ui
+from PIL import Image
 
 from nerif.analysis.consistency_file import CheckFindings, read_findings
 from nerif.app.elements import CommandLine, FileChoice, card, items_html, refusals, table_html, text_html
@@ -15,11 +17,15 @@ from nerif.app.job_form import JobForm, JobStatus
 from nerif.app.jobs import Job
 from nerif.app.project import OWN
 from nerif.app.workspace import Workspace
+from nerif.cli.commands.body import BodyInFlow
 from nerif.cli.commands.check import Check
 
 __all__ = ["PAGE", "findings_file"]
 
 AGREE = "Each is predicted by a quick reconstruction from the others."
+MODEL = "A body that hides a part of the background: give its surface."
+MODEL_SETTINGS = ("unit", "rotation", "translation", "refine", "margin")
+NO_MODEL = "A file of its surface in the folder (.stl, .obj, .ply) can be added here."
 REFINE = "Cameras are refined together with a quick field."
 VIEW_SETTINGS = ("voxels", "aperture")
 RIG_LINES = 60  # of its output: a table of the views and the findings
@@ -40,9 +46,10 @@ class CheckPage:
     ----------
     work : Workspace
     measurements : their names
+    models : names of the surfaces of bodies
     """
 
-    def __init__(self, work: Workspace, measurements: Sequence[str]) -> None:
+    def __init__(self, work: Workspace, measurements: Sequence[str], models: Sequence[str]) -> None:
         self.work = work
         with ui.element("div").classes("columns"):
             with ui.element("div").classes("stack"):
@@ -60,6 +67,8 @@ class CheckPage:
                         work, f"{PAGE.name}.rig", Form(record, only=RIG_SETTINGS), self._refine_words, "Refine",
                         lines=RIG_LINES,
                     )  # fmt: skip
+                with card("Is there a model in the flow?", MODEL), ui.element("div").classes("form"):
+                    self._build_model(models)
             with ui.element("div").classes("stack"):
                 with card("Findings"):
                     self.findings = ui.element("div").classes("stack").props('aria-live="polite"')
@@ -67,6 +76,46 @@ class CheckPage:
                     self.correction_status = JobStatus(work, f"{PAGE.name}.undone", on_continue=self.choice.choose)
         self.correction.set_visibility(bool(self.correction_status.job))
         self.show()
+
+    def _build_model(self, models: Sequence[str]) -> None:
+        """The form that adds a body to the measurement, and a figure of its outlines."""
+        self.outlines: ui.element | None = None
+        if not models:
+            text_html(NO_MODEL, classes="status")
+            return
+        work = self.work
+        name = work.draft(f"{PAGE.name}.body").get("model")
+        self.model = FileChoice("Model", models, name, work.models, self._on_model)
+        self.body = JobForm(
+            work, f"{PAGE.name}.body.form", Form(BodyInFlow(Path()), only=MODEL_SETTINGS), self._body_words,
+            "Add the model", out=self._with_model, on_end=self._on_body,
+        )  # fmt: skip
+        self.outlines = ui.element("div")
+        self._show_outlines()
+
+    def _with_model(self) -> str:
+        """The measurement with the model, in place of an earlier one."""
+        return f"{self.choice.name.removesuffix('.nc')}.body.nc"
+
+    def _body_words(self) -> list[str]:
+        return ["body", self.choice.name, self.model.name, "--out", self._with_model(), "--force"]
+
+    def _on_model(self) -> None:
+        self.work.keep(f"{PAGE.name}.body", {"model": self.model.name})
+        self.body.show()
+
+    async def _on_body(self, job: Job) -> None:
+        self._show_outlines()
+
+    def _show_outlines(self) -> None:
+        """Show the outlines of the model over the measured values."""
+        if self.outlines is None:
+            return
+        figure = self.work.project.path(self._with_model().removesuffix(".nc") + ".bodies.png")
+        self.outlines.clear()
+        if figure.is_file():
+            with self.outlines, Image.open(figure) as image:
+                ui.image(image.copy()).props('alt="Outlines of the model in each view"')
 
     def _record(self) -> Check:
         return Check(self.work.project.path(self.choice.name))
@@ -82,6 +131,9 @@ class CheckPage:
         self.correction.set_visibility(bool(self.correction_status.job))
         self.views.show()
         self.rig.show()
+        if self.outlines is not None:
+            self.body.show()
+            self._show_outlines()
         self.show()
 
     async def _on_end(self, job: Job) -> None:
@@ -157,7 +209,7 @@ async def build(work: Workspace) -> None:
     if not measurements:
         text_html("There is no measurement in the folder yet: Displacement makes one of images.", classes="status")
         return
-    CheckPage(work, measurements)
+    CheckPage(work, measurements, await work.models())
 
 
 PAGE = Page("check", "Check", "/check", "Errors of the data and of the calibration, before the reconstruction.", build)

@@ -17,8 +17,12 @@ from nerif.cli.commands.settings import Settings, command
 from nerif.common.conventions import InputError
 from nerif.data.body_file import read_body
 from nerif.data.measurement import Measurement
+from nerif.data.measurement_sequence import MeasurementSequence
+from nerif.geometry.body import Body, check_place
 from nerif.geometry.pose import rotation_matrix
-from nerif.imaging.bodies import with_bodies, without_bodies
+from nerif.imaging.bodies import film_with_bodies, read_poses, with_bodies, without_bodies
+from nerif.imaging.masks import drawn_masks
+from nerif.imaging.silhouettes import drawn_silhouettes, hull_of_silhouettes, refine_pose
 
 __all__ = ["BodyInFlow", "main", "run"]
 
@@ -27,23 +31,31 @@ Vector = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class BodyInFlow(Settings):
-    """Add opaque bodies to a measurement, from files of their surfaces (STL, OBJ, PLY).
+    """Add opaque bodies to a measurement or a film, from files of their surfaces (STL, OBJ, PLY) or from silhouettes.
 
     Pixels that see a body have no data any more. The reconstruction is NaN within it.
     """
 
     measurement: tyro.conf.Positional[Path]
-    """Measurement file."""
+    """Measurement file, or film (.zarr)."""
     models: tyro.conf.Positional[tuple[Path, ...]] = ()
     """Closed surfaces of triangles (.stl, .obj, .ply), one or more."""
     out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
-    """Measurement to write, NAME.nc, with a figure NAME.bodies.png."""
+    """Measurement to write, NAME.nc (a film: NAME.zarr), with a figure NAME.bodies.png."""
     unit: Literal["mm", "cm", "m", "in"] | None = None
     """Unit of the lengths in the files (default: mm, and a size that does not suit the box is refused)."""
     rotation: Vector = (0.0, 0.0, 0.0)
     """Rotation from the frame of the models to the world: its axis times its angle in degrees."""
     translation: Vector = (0.0, 0.0, 0.0)
     """Place of the origin of the models in the world, mm."""
+    refine: bool = False
+    """Refine the pose of each model by its outline: that of the silhouettes, or of the pixels without data."""
+    silhouettes: Path | None = None
+    """Folder with an image VIEW.png per view (white: body), to refine the pose; without a model, the body is their
+    visual hull."""
+    poses: Path | None = None
+    """Poses of models that move in a film: a table (.csv) with the columns rx, ry, rz (degrees), tx, ty, tz (mm) and a
+    row per frame."""
     margin: Annotated[int, Ge(0)] = 0
     """Pixels around those that see a body, without data either: half the correlation window, where it mixes the two."""
     remove: bool = False
@@ -54,28 +66,34 @@ class BodyInFlow(Settings):
 
 def run(settings: BodyInFlow) -> Measurement:
     """Write the measurement with its bodies."""
-    if settings.out is None:
-        raise InputError("expected the measurement to write, NAME.nc, got none", field="out")
-    image = settings.out.with_suffix(".bodies.png")
-    check_output(settings.out, settings.force, image, endings=(".nc",))
-    if bool(settings.models) == settings.remove:
-        raise InputError("expected the files of one or more models, or --remove", field="models")
-    measurement = Measurement.read(settings.measurement)
+    out, film = settings.out, settings.measurement.suffix == ".zarr"
+    ending = ".zarr" if film else ".nc"
+    if out is None:
+        raise InputError(f"expected the measurement to write, NAME{ending}, got none", field="out")
+    image = out.with_suffix(".bodies.png")
+    check_output(out, settings.force, image, endings=(ending,))
+    if bool(settings.models or settings.silhouettes) == settings.remove:
+        raise InputError("expected the files of one or more models, silhouettes, or --remove", field="models")
+    if settings.refine and not settings.models:
+        raise InputError("expected a model whose pose to refine, got none", field="refine")
+    if not film and settings.poses is not None:
+        raise InputError("expected a film (.zarr) for moving models, got a measurement", field="poses")
+    measurement = MeasurementSequence.read(settings.measurement).fullest() if film else None
+    measurement = measurement or Measurement.read(settings.measurement)
     if settings.remove:
         measurement = without_bodies(measurement)
-        measurement.write(settings.out)
-        say(f"{settings.out}: without bodies")
+        measurement.write(out)
+        say(f"{out}: without bodies")
         return measurement
-    rotation = rotation_matrix(torch.tensor(settings.rotation, dtype=torch.float64) * (math.pi / 180))
-    translation = torch.tensor(settings.translation, dtype=torch.float64)
-    read = [read_body(path, settings.unit or "mm", lambda line: say(f"note: {line}")) for path in settings.models]
-    bodies = [*measurement.bodies, *(body.moved(rotation, translation) for body in read)]
-    stated = settings.unit is not None
-    with counting_bar("pixels that see a body", len(measurement.names)) as bar:
-        measurement = with_bodies(measurement, bodies, settings.margin, stated, bar)
+    stated, bodies = settings.unit is not None, _bodies(settings, measurement)
+    if film:
+        measurement = _film(settings, bodies, out)
+    else:
+        with counting_bar("pixels that see a body", len(measurement.names)) as bar:
+            measurement = with_bodies(measurement, [*measurement.bodies, *bodies], settings.margin, stated, bar)
+        measurement.write(out)
     assert measurement.hidden is not None
-    measurement.write(settings.out)
-    for body in bodies:
+    for body in measurement.bodies:
         size = " x ".join(f"{e:.4g}" for e in (body.extent[1] - body.extent[0]).tolist())
         say(f"{body.name:<12} {len(body.faces)} triangles, {size} mm (x, y, z), {body.volume:.4g} mm3")
     for name, hidden, camera in zip(measurement.names, measurement.hidden, measurement.cameras, strict=True):
@@ -84,8 +102,44 @@ def run(settings: BodyInFlow) -> Measurement:
     from nerif.report.displacement_figure import save_masks
 
     save_masks(image, measurement, measurement.hidden)
-    say(f"{settings.out}: {len(bodies)} bod{'y' if len(bodies) == 1 else 'ies'}; outlines in {image}")
+    count = len(measurement.bodies)
+    say(f"{out}: {count} bod{'y' if count == 1 else 'ies'}; outlines in {image}")
     return measurement
+
+
+def _bodies(settings: BodyInFlow, measurement: Measurement) -> list[Body]:
+    """The bodies of the files at their pose, or that of the silhouettes."""
+    silhouettes = None
+    if settings.silhouettes is not None:
+        silhouettes = drawn_silhouettes(drawn_masks(settings.silhouettes, measurement.names), measurement)
+    if not settings.models:
+        assert silhouettes is not None
+        return [hull_of_silhouettes(measurement, silhouettes)]
+    rotation = rotation_matrix(torch.tensor(settings.rotation, dtype=torch.float64) * (math.pi / 180))
+    translation = torch.tensor(settings.translation, dtype=torch.float64)
+    bodies = []
+    for path in settings.models:
+        read = read_body(path, settings.unit or "mm", lambda line: say(f"note: {line}"))
+        body = read.moved(rotation, translation)
+        if settings.refine and settings.measurement.suffix != ".zarr":
+            check_place(body, measurement.box, settings.unit is not None)
+            pose = refine_pose(measurement, body, silhouettes, settings.margin)
+            say(pose.sentence)
+            body = pose.body
+        bodies.append(body)
+    return bodies
+
+
+def _film(settings: BodyInFlow, bodies: list[Body], out: Path) -> Measurement:
+    """Write the film with its bodies, and return its first complete frame."""
+    film = MeasurementSequence.read(settings.measurement)
+    poses = None if settings.poses is None else read_poses(settings.poses, len(bodies), len(film))
+    stated = settings.unit is not None
+    with counting_bar("frames", len(film)) as bar:
+        whole = film_with_bodies(
+            film, out, bodies, poses, settings.margin, stated, settings.refine, settings.force, bar
+        )
+    return whole.fullest()
 
 
 main = command("body", BodyInFlow, run)

@@ -56,7 +56,7 @@ REFINEMENT_WEIGHT = 0.1 * COARSE_WEIGHT  # while a rig is refined and no weight 
 ROUNDS = 20  # refinements of a rig on a level
 ROUNDS_WITHOUT_MOMENTUM = 5  # at the end of them
 ROUND_ITERATIONS = 8  # of the field after each refinement
-KNOWN_POINTS = 1 << 12  # for the constant of a field that is not pinned to the ambient index
+GAUGE_POINTS = 1 << 12  # for the constant of a field that is not pinned to the ambient index
 STATE = {
     "level": "level", "round": "round", "done": "iteration", "total": "iterations", "weight": "weight",
     "guess": "guess", "chosen": "reason", "choosing": "search_levels",
@@ -80,7 +80,7 @@ class Descent:
         self.settings, self.measurement, self.on_step, self.start = settings, measurement, on_step, start
         self.device = resolve_device(settings.device)
         self.cores = Cores(self.device)
-        check_gauge(measurement, bool(settings.known), settings.hull)
+        check_gauge(measurement, bool(settings.probes), settings.hull)
         self.axis = axis_of(settings, measurement)
         dtype = getattr(torch, settings.precision)
         self.layout = layout_of(measurement, self.axis, settings.basis, settings.step, self.device, dtype)
@@ -89,7 +89,7 @@ class Descent:
         finest = grids[-1]
         self._check_memory(finest.shape, settings.memory_bytes(measurement, finest, self.device.type))
         self.free = self.layout.free(measurement, finest, settings.hull)
-        self.known = self._known()
+        self.gauge = self._gauge()
         bounds = field_bounds(measurement, settings.lower, settings.upper)
         self.bounds = bounds if any(map(math.isfinite, bounds)) else None
         self.finest_target = self._target(self.levels[-1].edge)
@@ -124,18 +124,18 @@ class Descent:
                 field="voxels",
             )
 
-    def _known(self) -> Gauge | None:
+    def _gauge(self) -> Gauge | None:
         """Where the field is known, if that alone fixes its constant: the solution is shifted to it."""
         pinned = self.layout.faces or (self.free is not None and not bool(self.free.all()))
-        if pinned and self.settings.known:
+        if pinned and self.settings.probes:
             raise InputError(
-                "expected no ambient faces, region or masks beside known points for a voxel method, which shifts its "
-                "field to the points; leave one of the two out, or take --method nerif",
-                field="known",
+                "expected no ambient faces, region or masks beside probes for a voxel method, which shifts its "
+                "field to them; leave one of the two out, or take --method nerif",
+                field="probes",
             )
         if pinned or not is_open(self.measurement):
             return None
-        return Gauge.of(self.measurement, self.settings.known)
+        return Gauge.of(self.measurement, self.settings.probes)
 
     # -- levels ----------------------------------------------------------------------------------------------------
 
@@ -217,8 +217,8 @@ class Descent:
         """The field of the present solution, on the grid of the level."""
         assert self.x is not None
         coefficients = self.x * self.scale
-        if self.known is not None:
-            points, values = self.known.sample(KNOWN_POINTS, torch.Generator().manual_seed(0))
+        if self.gauge is not None:
+            points, values = self.gauge.sample(GAUGE_POINTS, torch.Generator().manual_seed(0))
             field = self.layout.field(coefficients.cpu(), level.grid)
             coefficients = coefficients + float((values - field(points)).mean())
         return self.layout.field(coefficients, level.grid)

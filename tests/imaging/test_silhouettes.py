@@ -1,0 +1,169 @@
+"""Outlines of bodies: refined poses, visual hulls, and bodies that move in a film."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from bodies import ball, cuboid
+from nerif.cli.cli import main
+from nerif.data.body_file import read_body
+from nerif.data.measurement import Measurement
+from nerif.data.measurement_sequence import MeasurementSequence
+from nerif.fields.phantoms import make_phantom
+from nerif.geometry import Box, Ring
+from nerif.geometry.body import contained, hidden_pixels
+from nerif.geometry.pose import rotation_matrix
+from nerif.imaging.bodies import film_with_bodies, with_bodies
+from nerif.imaging.silhouettes import drawn_silhouettes, hull_of_silhouettes, outline, refine_pose, silhouettes_of
+from nerif.simulation.simulate import simulate
+from nerif.workflow.sequence.store import SequenceStore
+from refusals import refused
+
+BOX = Box.cube(40.0)
+BRICK = cuboid((-8.0, -5.0, -3.0), (8.0, 5.0, 3.0), name="brick")
+
+
+@pytest.fixture(scope="module")
+def flow() -> Measurement:
+    ring = Ring(views=5, arc=(0.0, 150.0), image_size=(64, 64), pixel_pitch=0.05)
+    return simulate(make_phantom("gaussians", BOX, 0), ring.cameras(), BOX, 1.00027, 0.05, seed=1)
+
+
+def turned(body, degrees=(2.0, -3.0, 1.5), shift=(0.6, -0.4, 0.8)):
+    rotation = rotation_matrix(torch.tensor(degrees, dtype=torch.float64).deg2rad())
+    return body.moved(rotation, torch.tensor(shift, dtype=torch.float64))
+
+
+def write_stl(path, body) -> None:
+    import trimesh
+
+    trimesh.Trimesh(body.vertices.numpy(), body.faces.numpy(), process=False).export(path)
+
+
+def test_an_outline_is_halfway_between_pixels():
+    mask = torch.zeros(5, 6, dtype=torch.bool)
+    mask[2, 3] = True
+    points = {tuple(point) for point in outline(mask).tolist()}
+    assert points == {(2.5, 2.0), (3.5, 2.0), (3.0, 1.5), (3.0, 2.5)}
+
+
+def test_the_pose_of_a_body_is_that_of_its_outlines(flow):
+    there = turned(BRICK)
+    seen = with_bodies(flow, [there])
+    pose = refine_pose(replace(flow, displacement=seen.displacement), BRICK)
+    assert pose.unknown == ()
+    assert float((pose.body.vertices - there.vertices).norm(dim=1).max()) < 0.3  # mm; a pixel is 0.7 mm
+    errors = torch.cat([pose.turn - torch.tensor([2.0, -3.0, 1.5]).deg2rad(), torch.zeros(3)])[:3]
+    assert bool((errors.abs() < 4 * pose.sigma[:3]).all())
+    assert pose.residual < 0.5
+    assert "brick: turned by" in pose.sentence
+
+
+def test_turns_of_a_ball_are_not_determined(flow):
+    there = ball(6.0, (1.0, -2.0, 0.5))
+    seen = with_bodies(flow, [there])
+    pose = refine_pose(seen, ball(6.0, (0.2, -1.5, 0.0)))
+    assert {name for name in pose.unknown if name.startswith("turn")} == {f"turn about {axis}" for axis in "xyz"}
+    torch.testing.assert_close(pose.body.vertices.mean(dim=0), there.vertices.mean(dim=0), atol=0.15, rtol=0)
+    assert "not determined: turn about" in pose.sentence
+
+
+def test_an_outline_far_away_is_refused(flow):
+    seen = with_bodies(flow, [BRICK])
+    with refused("brick"):
+        refine_pose(seen, turned(BRICK, shift=(0.0, 0.0, 17.0)))
+
+
+def test_the_hull_of_silhouettes_contains_the_body(flow):
+    there = ball(7.0, (1.0, 2.0, -1.0))
+    silhouettes = torch.stack([hidden_pixels(camera, [there]) for camera in flow.cameras])
+    hull = hull_of_silhouettes(flow, silhouettes, 64)
+    inner = ball(6.5, (1.0, 2.0, -1.0)).vertices
+    assert bool(contained([hull], inner).all())
+    assert 1.0 < hull.volume / there.volume < 1.4
+    with refused("silhouettes"):
+        hull_of_silhouettes(flow, torch.zeros_like(silhouettes))
+
+
+def test_silhouettes_on_the_command_line(flow, tmp_path, capsys):
+    there, folder = turned(BRICK), tmp_path / "drawn"
+    folder.mkdir()
+    for name, camera in zip(flow.names, flow.cameras, strict=True):
+        Image.fromarray(hidden_pixels(camera, [there]).numpy().astype(np.uint8) * 255).save(folder / f"{name}.png")
+    flow.write(tmp_path / "m.nc")
+    write_stl(tmp_path / "brick.stl", BRICK)
+    refine = ["body", str(tmp_path / "m.nc"), str(tmp_path / "brick.stl"), "--refine", "--silhouettes", str(folder)]
+    assert main([*refine, "-o", str(tmp_path / "refined.nc")]) == 0
+    assert "turned by" in capsys.readouterr().out
+    (body,) = Measurement.read(tmp_path / "refined.nc").bodies
+    assert float((body.vertices.mean(dim=0) - there.vertices.mean(dim=0)).norm()) < 0.2
+    hull = ["body", str(tmp_path / "m.nc"), "--silhouettes", str(folder), "-o", str(tmp_path / "hull.nc")]
+    assert main(hull) == 0
+    (body,) = Measurement.read(tmp_path / "hull.nc").bodies
+    assert body.name == "hull"
+    silhouettes = drawn_silhouettes({flow.names[0]: folder / f"{flow.names[0]}.png"}, flow)
+    assert not bool(silhouettes[1:].any())
+
+
+@pytest.fixture(scope="module")
+def film(flow, tmp_path_factory) -> MeasurementSequence:
+    """Two frames without a body."""
+    sequence = MeasurementSequence.create(tmp_path_factory.mktemp("film") / "film.zarr", (0.0, 0.1), flow)
+    for index in range(2):
+        sequence.write_frame(index, flow)
+    return sequence
+
+
+POSES = "rx,ry,rz,tx,ty,tz\n0,0,0,0,0,0\n0,0,5,1.5,0,-1\n"
+
+
+def test_a_body_that_moves_in_a_film(film, tmp_path, capsys):
+    write_stl(tmp_path / "brick.stl", BRICK)
+    (tmp_path / "poses.csv").write_text(POSES)
+    words = ["body", str(film.path), str(tmp_path / "brick.stl"), "--poses", str(tmp_path / "poses.csv")]
+    assert main([*words, "-o", str(tmp_path / "moving.zarr")]) == 0
+    moving = MeasurementSequence.read(tmp_path / "moving.zarr")
+    first, second = moving.frame(0), moving.frame(1)
+    assert bool((first.hidden != second.hidden).any())
+    there = turned(BRICK, (0.0, 0.0, 5.0), (1.5, 0.0, -1.0))
+    torch.testing.assert_close(second.bodies[0].extent[1], there.extent[1], atol=1e-5, rtol=0)
+    (tmp_path / "short.csv").write_text(POSES.rsplit("\n", 2)[0] + "\n")
+    for content, message in ((POSES.rsplit("\n", 2)[0], "expected 2 rows"), ("a,b\n1,2\n", "columns rx")):
+        (tmp_path / "wrong.csv").write_text(content)
+        words[4] = str(tmp_path / "wrong.csv")
+        assert main([*words, "-o", str(tmp_path / "other.zarr")]) == 2
+        assert message in capsys.readouterr().err
+    quick = ["--max-steps", "20", "--network.width", "16", "--voxels", "24", "--device", "cpu"]
+    store = tmp_path / "result.zarr"
+    assert main(["sequence", str(moving.path), "-o", str(store), *quick]) == 0
+    result = SequenceStore(store)
+    for index, measurement in enumerate((first, second)):
+        volume = result.volume(index, "index_excess")
+        inside = contained(measurement.bodies, volume.grid.points())
+        assert torch.equal(volume.values.isnan(), inside)
+        assert bool(result.field(index)(torch.tensor([[12.0, 3.0, 2.0]])).isfinite().all())
+
+
+def test_the_pose_in_each_frame_is_refined(flow, film, tmp_path):
+    seen = MeasurementSequence.create(tmp_path / "seen.zarr", film.times, flow)
+    places = [(0.0, 0.0, 0.0), (0.8, -0.5, 0.4)]
+    for index, shift in enumerate(places):
+        seen.write_frame(
+            index, replace(flow, displacement=with_bodies(flow, [turned(BRICK, shift=shift)]).displacement)
+        )
+    whole = film_with_bodies(seen, tmp_path / "refined.zarr", [BRICK], refine=True)
+    for index, shift in enumerate(places):
+        (body,) = whole.frame(index).bodies
+        expected = turned(BRICK, shift=shift).vertices.mean(dim=0)
+        torch.testing.assert_close(body.vertices.mean(dim=0), expected, atol=0.2, rtol=0)
+    assert bool(silhouettes_of(whole.frame(0)).any())
+
+
+def test_a_written_model_is_read_as_it_was(tmp_path):
+    write_stl(tmp_path / "brick.stl", BRICK)
+    assert read_body(tmp_path / "brick.stl").volume == pytest.approx(BRICK.volume)
