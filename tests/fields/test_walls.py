@@ -40,6 +40,8 @@ def test_the_direction_fades_and_points_away_from_both_sides():
     torch.testing.assert_close(up, torch.tensor([[0.0, 0.0, 1.0]]), atol=1e-3, rtol=0)
     torch.testing.assert_close(down, -up)
     assert not bool(from_surface([PLATE], far, 4.0)[0].any())
+    on = torch.tensor([[1.0, 2.0, 0.25], [1.0, 2.0, -0.25]], dtype=torch.float64)
+    torch.testing.assert_close(from_surface([PLATE], on, 4.0)[0], torch.cat([up, down]).double(), atol=1e-3, rtol=0)
     middle, _ = from_surface([PLATE], torch.tensor([[0.0, 0.0, 2.25]]), 4.0)
     assert float(middle[0, 2]) == pytest.approx((1 - 0.25) ** 2)
 

@@ -10,7 +10,7 @@ import torch
 
 from bodies import ball, cuboid
 from nerif.geometry import Box, Ring
-from nerif.geometry.body import Body, check_place, contained, hidden_pixels
+from nerif.geometry.body import Body, check_place, contained, hidden_pixels, is_thin
 from nerif.geometry.pose import rotation_matrix
 from nerif.geometry.rays import Rays
 from refusals import refused
@@ -164,3 +164,11 @@ def test_a_body_behind_the_background_hides_nothing():
     camera = Ring(views=1, image_size=(40, 40)).cameras()[0]
     away = camera.plane.normal * (camera.plane.offset + 30 * (1 if camera.plane.offset > 0 else -1))
     assert not bool(hidden_pixels(camera, [ball(5.0, tuple(away.tolist()))]).any())
+
+
+def test_plates_are_thin_and_balls_are_not():
+    plate = cuboid((-10.0, -8.0, -0.25), (10.0, 8.0, 0.25))
+    assert is_thin(plate, 1.0)
+    assert not is_thin(plate, 0.4)
+    assert not is_thin(ball(6.0), 2.0)
+    assert is_thin(ball(6.0), 13.0)

@@ -11,6 +11,7 @@ import torch
 
 from bodies import ball, cuboid
 from nerif.analysis.evaluation import evaluate
+from nerif.analysis.prediction import reproject
 from nerif.cli.cli import main
 from nerif.common.conventions import InputError
 from nerif.data.body_file import read_body
@@ -97,6 +98,11 @@ def test_pixels_without_data_that_show_the_body_mirrored_name_the_axis(flow):
         with_bodies(blank, [mirrored])
     assert "axes as (-x, y, z)" in str(error.value)
     assert with_bodies(blank, [there]).bodies == (there,)
+
+
+def test_predictions_have_no_value_where_a_body_hides_the_background(with_ball):
+    predicted = reproject(make_phantom("gaussians", BOX, 0), with_ball).maps["deflection"]
+    assert torch.equal(predicted.isnan().all(dim=-1), with_ball.hidden)
 
 
 def test_ambient_points_and_hull_respect_bodies(flow):

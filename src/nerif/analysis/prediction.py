@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn import Module
 
 from nerif.common.conventions import InputError
 from nerif.common.pauses import pause
@@ -18,9 +17,10 @@ from nerif.data.reprojection import Accuracy, Reprojection
 from nerif.data.volume import name_of
 from nerif.fields.base import Field
 from nerif.fields.grid import VoxelField
-from nerif.fields.network import NeuralField
+from nerif.fields.network import Network, NeuralField
 from nerif.fields.sum import SumField
 from nerif.fields.symmetric import SymmetricVoxels, symmetry_of_field
+from nerif.fields.walls import WallNetwork
 from nerif.forward.base import ForwardModel
 from nerif.forward.path_integral import LENS_RAYS, FieldProjector, PathIntegral, project
 from nerif.forward.ray_tracing import CurvedRays
@@ -35,6 +35,7 @@ SAMPLES = 80  # per ray; error 0.06 % of the rms displacement for a network fitt
 SAMPLES_PER_VOXEL = 2  # the same for the splines of its detail
 GRADIENT_COST = 3.0  # of value and gradient, in evaluations: a forward pass and a backward pass of twice its work
 EXACT_WORK = {"cpu": 1e11, "cuda": 1e13}  # multiplications: four seconds on two cores
+WALLS = 5  # times as many beside bodies, where splines would smooth the jump across a thin plate
 SPLINE_VOXELS, SPLINE_MARGIN = 100, 3  # along the longest edge of the box, and beyond each face
 SYMMETRIC_VOXELS = 400  # along the longest edge of (r, h)
 RAYS_PER_VOXEL = 1.4  # along an edge, at least
@@ -161,7 +162,7 @@ def reproject(
     box, maps, accuracies, done = measurement.box, {}, {}, 0
     integrals: dict[tuple[ForwardModel, int], Tensor] = {}  # images and displacements share one
     network, *splines = field.parts if isinstance(field, SumField) else (field,)
-    large = _work(network, measurement.cameras) > EXACT_WORK[torch.device(device).type]
+    large = isinstance(network, NeuralField) and not _is_exact(network.network, _points(measurement.cameras), device)
     voxels = on_voxels(network, box, device) if large else None
     total = sum(len(_views_of(kind, measurement.cameras)) for kind in measurement.techniques)
     for observation in measurement.observations:
@@ -182,6 +183,8 @@ def reproject(
             predicted[i, :height, :width] = forward.to_map(integrals[integral, i], i)
             done += 1
             on_view(done, total)
+        if measurement.hidden is not None:
+            predicted[measurement.hidden] = torch.nan  # they see a body
         maps[kind.name] = predicted
         technique = type(integral) if integral is not forward else kind
         if technique.measured not in accuracies:
@@ -198,11 +201,10 @@ def _views_of(kind: type[ForwardModel], cameras: Sequence[Camera]) -> list[int]:
     return [i for i, camera in enumerate(cameras) if camera.background or not kind.background]
 
 
-def _work(field: Field, cameras: Sequence[Camera]) -> float:
-    """Multiplications of the path integral through a network on every pixel; 0 for other fields."""
-    if not isinstance(field, NeuralField):
-        return 0.0
-    return sum(p.numel() for p in field.network.parameters()) * _points(cameras)
+def _is_exact(network: Network, points: float, device: torch.device | str) -> bool:
+    """Whether the path integral through a network is computed on every pixel, at some points in all."""
+    most = EXACT_WORK[torch.device(device).type] * (WALLS if isinstance(network, WallNetwork) else 1)
+    return sum(p.numel() for p in network.parameters()) * points <= most
 
 
 def _samples(field: Field) -> int:
@@ -218,10 +220,10 @@ def _points(cameras: Sequence[Camera]) -> float:
     return sum(n * c.image_size[0] * c.image_size[1] for n, c in zip(samples, cameras, strict=True))
 
 
-def evaluations(network: Module, cameras: Sequence[Camera], box: Box, device: torch.device | str = "cpu") -> float:
+def evaluations(network: Network, cameras: Sequence[Camera], box: Box, device: torch.device | str = "cpu") -> float:
     """Return how many evaluations of a network `reproject` takes; value and gradient count as GRADIENT_COST of them."""
     points = _points(cameras)
-    if sum(p.numel() for p in network.parameters()) * points <= EXACT_WORK[torch.device(device).type]:
+    if _is_exact(network, points, device):
         return GRADIENT_COST * points
     return float(math.prod(_extended(Grid.of_resolution(box, SPLINE_VOXELS), (0, 1, 2)).shape))
 

@@ -62,7 +62,8 @@ class Reprojection:
 
     Parameters
     ----------
-    maps : (view, row, column, c) predicted values, by the name of the technique; 0 where a ray misses the box
+    maps : (view, row, column, c) predicted values, by the name of the technique; 0 where a ray misses the box, NaN
+        where a pixel sees a body
     withheld : names of the views withheld from the reconstruction
     accuracies : of the prediction by technique; empty if unknown (from a file)
     """

@@ -24,22 +24,18 @@ if TYPE_CHECKING:
     from nerif.geometry.mesh_kernel import Tree
 
 __all__ = [
-    "UNITS",
-    "Body",
-    "check_place",
-    "contained",
-    "fine_triangles",
-    "from_surface",
-    "hidden_pixels",
+    "UNITS", "Body", "check_place", "contained", "fine_triangles", "from_surface", "hidden_pixels", "is_thin",
     "orientations",
-]
+]  # fmt: skip
 
 UNITS = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4}
 """Lengths of models in files, mm."""
 LENS_RAYS = 16  # per pixel with a lens or a window
 RAYS_AT_A_TIME = 1 << 16
+MANY = 512  # points, for which several threads are worth while
+THICKNESS_POINTS, THIN_SHARE = 2000, 0.05  # of the surface; the share that makes a body thin
 MOST_PARTS = 200  # of the edge of a triangle
-TOUCHING = 1e-4  # of the reach, below which a point is taken to be this far from the surface
+TOUCHING = 1e-4  # of the reach, below which a point is on the surface: n is that of the triangle
 CORNER = 1e-9  # of barycentric coordinates: 0
 TINY, LARGE = 0.01, 20.0  # of the box, beyond which the size of a body is not meant
 
@@ -178,6 +174,22 @@ class Body:
         return torch.where(self.contains(points), -distance, distance)
 
 
+def is_thin(body: Body, thickness: float) -> bool:
+    """Return whether a part of a body is thinner than a length, mm, along its inward normals."""
+    from nerif.geometry.mesh_kernel import first_hits
+
+    generator = torch.Generator().manual_seed(0)
+    a, b, c = body.corners.unbind(dim=1)
+    areas = torch.linalg.cross(b - a, c - a).norm(dim=-1)
+    face = torch.multinomial(areas, THICKNESS_POINTS, replacement=True, generator=generator)
+    weights = torch.rand(THICKNESS_POINTS, 2, generator=generator, dtype=torch.float64)
+    weights = torch.where(weights.sum(dim=1, keepdim=True) > 1, 1 - weights, weights)  # of an even distribution
+    points = a[face] + weights[:, :1] * (b - a)[face] + weights[:, 1:] * (c - a)[face]
+    inwards, end = -body.normals[face], torch.full_like(areas[face], thickness)
+    hits = first_hits(body._tree, *(part.contiguous().numpy() for part in (points, inwards, 1e-6 * end, end)))
+    return float(np.isfinite(hits).mean()) > THIN_SHARE
+
+
 def fine_triangles(body: Body, edge: float) -> tuple[Float[Tensor, "n 3"], Int[Tensor, "m 3"], Float[Tensor, "n 3"]]:
     """Return the surface in triangles whose edges are at most `edge` (mm): vertices, triangles, outward normals.
 
@@ -228,23 +240,28 @@ def from_surface(
     """
     from nerif.geometry.mesh_kernel import closest
 
+    threads = torch.get_num_threads()
     flat = points.detach().cpu().double().contiguous()
     best = torch.full((len(flat),), torch.inf, dtype=torch.float64)
     v, slope = torch.zeros_like(flat), flat.new_zeros(len(flat), 3, 3)
-    for body in bodies:
-        lower, upper = body.extent
-        near = ((flat > lower - reach) & (flat < upper + reach)).all(dim=-1).nonzero().flatten()
-        where, weights, face = map(torch.from_numpy, closest(body._tree, flat[near].numpy(), reach))
-        offset = flat[near] - where
-        distance = offset.norm(dim=-1)
-        nearer = (distance < best[near]).nonzero().flatten()  # not if it is NaN
-        d, index = distance[nearer].clamp_min(TOUCHING * reach), near[nearer]
-        n = offset[nearer] / d[:, None]
-        u = d / reach
-        w, fall = (1 - u**2) ** 2, -4 * u * (1 - u**2) / reach
-        bend = _bend(n, weights[nearer], body.corners[face[nearer]]) / d[:, None, None]
-        best[index], v[index] = distance[nearer], w[:, None] * n
-        slope[index] = fall[:, None, None] * n[:, :, None] * n[:, None] + w[:, None, None] * bend
+    with ThreadPoolExecutor(threads) as pool:
+        for body in bodies:
+            lower, upper = body.extent
+            near = ((flat > lower - reach) & (flat < upper + reach)).all(dim=-1).nonzero().flatten()
+            pieces = flat[near].chunk(threads if len(near) > MANY else 1)
+            nearest = list(pool.map(lambda piece, body=body: closest(body._tree, piece.numpy(), reach), pieces))
+            where, weights, face = (torch.from_numpy(np.concatenate(part)) for part in zip(*nearest, strict=True))
+            offset = flat[near] - where
+            distance = offset.norm(dim=-1)
+            nearer = (distance < best[near]).nonzero().flatten()  # not if it is NaN
+            d, index = distance[nearer].clamp_min(TOUCHING * reach), near[nearer]
+            touching = distance[nearer] < TOUCHING * reach
+            n = torch.where(touching[:, None], body.normals[face[nearer]], offset[nearer] / d[:, None])
+            u = d / reach
+            w, fall = (1 - u**2) ** 2, -4 * u * (1 - u**2) / reach
+            bend = _bend(n, weights[nearer], body.corners[face[nearer]]) / d[:, None, None]
+            best[index], v[index] = distance[nearer], w[:, None] * n
+            slope[index] = fall[:, None, None] * n[:, :, None] * n[:, None] + w[:, None, None] * bend
     return v.to(points), slope.to(points)
 
 

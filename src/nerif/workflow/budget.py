@@ -12,7 +12,7 @@ import torch
 
 from nerif.analysis.prediction import evaluations
 from nerif.data.measurement import Measurement
-from nerif.fields.network import Network
+from nerif.fields.network_kinds import network_in
 from nerif.geometry import Grid
 from nerif.reconstruction.base import Reconstructor
 from nerif.reconstruction.device import resolve_device
@@ -89,7 +89,8 @@ def _sampling(reconstructor: Reconstructor, measurement: Measurement, voxels: in
         return 0.0
     device = resolve_device(reconstructor.device)
     with torch.random.fork_rng(devices=[]):
-        network = Network(reconstructor.resolved_by(measurement).network).to(device)
+        shape = reconstructor.resolved_by(measurement).network
+        network = network_in(measurement.box, shape, bodies=measurement.bodies).to(device)
     points = torch.zeros(PROBE, 3, device=device)
     times = []
     for _ in range(4):  # the first is slower

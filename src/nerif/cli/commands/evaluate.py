@@ -73,7 +73,8 @@ def _print_volume(metrics: dict[str, Any]) -> None:
     say(f"PSNR          {metrics['psnr']:8.2f} dB")
     say("   z [mm]      CC    SSIM   PSNR [dB]")
     for s in metrics["slices"]:
-        say(f"{s['z_mm']:9.2f} {s['cc']:7.4f} {s['ssim']:7.4f} {s['psnr']:11.2f}")
+        line = f"{s['z_mm']:9.2f} {s['cc']:7.4f} {s['ssim']:7.4f} {s['psnr']:11.2f}"
+        say(line if math.isfinite(s["cc"]) else f"{s['z_mm']:9.2f}   the truth does not vary")
 
 
 def _print_views(views: list[ViewScores]) -> None:
