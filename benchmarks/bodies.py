@@ -201,13 +201,13 @@ def measure(
         measurement.write(Path(temporary) / "m.nc")
         start = time.perf_counter()
         field = reconstruct_into(Path(temporary) / "r", Path(temporary) / "m.nc", reconstructor, run).field
-        taken = time.perf_counter() - start
+        elapsed = time.perf_counter() - start
     scores = (
         of_plate(plate, mesh, field)
         if plate is not None
         else of_cone(ROOT / data["folder_of_bodies"], field, flow == "cut")
     )
-    return {"time": taken, **scores}
+    return {"time": elapsed, **scores}
 
 
 def of_plate(plate: Plate, mesh: Any, field: Field) -> dict[str, float]:

@@ -8,11 +8,13 @@ import pytest
 import torch
 import xarray as xr
 
+from bodies import cuboid
 from nerif.analysis import prediction
 from nerif.analysis.prediction import SampledViews, on_voxels, reproject
 from nerif.data.measurement import Measurement
 from nerif.data.reprojection import Accuracy, Reprojection
 from nerif.fields.network import Network, NetworkShape, NeuralField
+from nerif.fields.network_kinds import network_in
 from nerif.fields.phantoms import GaussianBalls
 from nerif.forward.deflection import MODELS, Deflection
 from nerif.forward.path_integral import PathIntegral
@@ -89,13 +91,17 @@ def test_each_technique_has_its_own_error_and_the_network_is_sampled_once(networ
     assert [" px rms" in accuracy.sentence for accuracy in sampled.accuracies] == [True, False]
 
 
-def test_only_networks_on_many_pixels_are_sampled(network, empty, ball):
-    weights = sum(p.numel() for p in network.network.parameters())
-    assert prediction._work(network, empty.cameras) == weights * prediction.SAMPLES * 2 * 40 * 46
-    assert prediction._work(ball, empty.cameras) == 0
-    paper = NeuralField(Network(NetworkShape()), BOX, 1e-3)
-    full = Ring(views=12, image_size=(1024, 1024)).cameras()
-    assert prediction._work(paper, full) > prediction.EXACT_WORK["cpu"]
+def test_only_networks_on_many_pixels_are_sampled(network, empty):
+    points = prediction._points(empty.cameras)
+    assert points == prediction.SAMPLES * 2 * 40 * 46
+    assert prediction._is_exact(network.network, points, "cpu")
+    paper = Network(NetworkShape())
+    full = prediction._points(Ring(views=12, image_size=(1024, 1024)).cameras())
+    assert not prediction._is_exact(paper, full, "cpu")
+    most = prediction.EXACT_WORK["cpu"] / sum(p.numel() for p in paper.parameters())
+    walls = network_in(BOX, NetworkShape(), bodies=[cuboid((-5.0, -5.0, -0.1), (5.0, 5.0, 0.1))])
+    assert not prediction._is_exact(paper, 2 * most, "cpu")
+    assert prediction._is_exact(walls, 2 * most, "cpu")
 
 
 def test_the_file_records_how_it_was_predicted(network, empty, tmp_path):

@@ -176,6 +176,8 @@ class Network(nn.Module):
 
     layered: ClassVar[bool] = True
     """Whether the n head is a function of the last layer only."""
+    compilable: ClassVar[bool] = True
+    """Whether PyTorch can compile it."""
     beside: ClassVar[int] = 0
     """Inputs of the first layer beside the encoding."""
     gains: Tensor

@@ -33,6 +33,7 @@ class WallNetwork(Network):
     """
 
     beside: ClassVar[int] = 3
+    compilable: ClassVar[bool] = False
 
     def __init__(self, shape: NetworkShape, bodies: Sequence[Body], bounds: tuple[float, float] = UNBOUNDED) -> None:
         super().__init__(shape, bounds)
@@ -46,7 +47,6 @@ class WallNetwork(Network):
         slope = encode_pullback(encoded[:, : -self.beside], cotangent[:, : -self.beside], self.waves)
         return slope + (cotangent[:, -self.beside :, None] * self._directions(p)[1]).sum(dim=1)
 
-    @torch.compiler.disable
     def _directions(self, p: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3 3"]]:
         """The faded directions at points, and their derivatives; kept, since a step needs them twice."""
         last = self._last

@@ -88,7 +88,7 @@ class MixedPrecision:
         self.remark = ""
         """Why compilation failed."""
         self.evaluate: Evaluation = network.value_and_gradient
-        if compile == "on" or (compile == "auto" and device.type == "cuda"):
+        if network.compilable and (compile == "on" or (compile == "auto" and device.type == "cuda")):
             self.evaluate = self._compiled(network.value_and_gradient)
         self.fused: Callable[[Network, Tensor], tuple[Tensor, Tensor]] | None = None
         if compile == "auto" and device.type == "cpu" and _fusible(network):
