@@ -205,3 +205,11 @@ def test_the_pixels_that_see_the_cone_are_those_without_data():
     with refused("cone") as error:
         with_bodies(measurement, [upside_down])
     assert "axes as (x, y, -z)" in str(error.value)
+
+
+def test_a_thin_body_beside_a_thick_one_hides_pixels_as_well(flow):
+    thick, wire = ball(6.0), cuboid((12.0, -8.0, 6.02), (16.0, 8.0, 6.06), name="wire")
+    alone = with_bodies(flow, [wire]).hidden
+    both = with_bodies(flow, [thick, wire]).hidden
+    assert bool(alone.any())
+    assert bool((alone <= both).all())

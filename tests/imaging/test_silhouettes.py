@@ -138,6 +138,11 @@ def test_a_body_that_moves_in_a_film(film, tmp_path, capsys):
         words[4] = str(tmp_path / "wrong.csv")
         assert main([*words, "-o", str(tmp_path / "other.zarr")]) == 2
         assert message in capsys.readouterr().err
+    for wrong, field in ((["--remove"], "models"), (["--silhouettes", str(tmp_path)], "silhouettes")):
+        assert main([*words[:4], str(tmp_path / "poses.csv"), *wrong, "-o", str(tmp_path / "other.zarr")]) == 2
+        assert field in capsys.readouterr().err
+    assert main([*words[:4], str(tmp_path / "poses.csv"), "-o", str(film.path), "--force"]) == 2
+    assert "frame by frame" in capsys.readouterr().err
     quick = ["--max-steps", "20", "--network.width", "16", "--voxels", "24", "--device", "cpu"]
     store = tmp_path / "result.zarr"
     assert main(["sequence", str(moving.path), "-o", str(store), *quick]) == 0

@@ -105,3 +105,17 @@ def test_a_gauge_that_cannot_be_is_refused(measurement, corner, probe):
         replace(SMOOTH, probes=(probe,))(masked)
     with refused("ambient_faces"):
         QUICK(replace(measurement, ambient_faces=()))
+
+
+def test_faces_that_are_stated_count_for_techniques_without_a_gauge(measurement):
+    from nerif.forward.absorption import Absorption
+
+    values = measurement.displacement[..., :1].abs()
+    absorbing = Measurement(
+        tuple(Absorption.seen_by(camera) for camera in measurement.cameras), None, measurement.box, 1.0,
+        maps={"absorbance": values[..., 0]},
+    )  # fmt: skip
+    assert with_gauge(absorbing, QUICK).ambient_faces == ()
+    assert with_gauge(absorbing, replace(QUICK, ambient_faces=("z-",))).ambient_faces == ("z-",)
+    with refused("probes"):
+        with_gauge(absorbing, replace(QUICK, probes=((0.0, 0.0, 0.0, 1.0),)))

@@ -254,10 +254,11 @@ def binned(measurement: Measurement, max_pixels: int) -> Measurement:
         mean = mean if observation.signed else mean.clamp_min(0)  # negative values are noise, and refused without sigma
         dense = count * 2 >= down * across
         maps.append(torch.where(dense if bool(dense.any()) else count > 0, mean, torch.nan))
-    return measurement_of(
+    small = measurement_of(
         {observation.technique: torch.stack(maps)}, cameras, measurement.box, measurement.n_ambient,
         measurement.wavelength_nm, measurement.ambient_faces,
     )  # fmt: skip
+    return replace(small, ambient_region=measurement.ambient_region)
 
 
 def without_spikes(small: Measurement) -> Measurement:

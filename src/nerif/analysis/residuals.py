@@ -137,7 +137,9 @@ def _tested(residual: Map, predicted: Map | None, mask: Mask, edge: int) -> _Blo
     correlated = energy > max(1 + SIGNIFICANT * math.sqrt(2 / z.size), MIN_GRAIN[edge] ** 2)
     shares: dict[str, float] = {}
     for cause, patterns in (_patterns(predicted) if correlated and predicted is not None else {}).items():
-        means = [_block_sums(np.where(mask[..., None], p, 0.0), edge)[full] / np.sqrt(n) for p in patterns]
+        means = [
+            _block_sums(np.where(mask[..., None] & np.isfinite(p), p, 0.0), edge)[full] / np.sqrt(n) for p in patterns
+        ]
         shares[cause] = _explained(z, np.stack(means, axis=-1))
     worst = int(np.argmax((z**2).sum(axis=1)))
     row, column = (float(i + 0.5) * edge for i in np.argwhere(full)[worst])

@@ -159,7 +159,7 @@ def to_dataset(measurement: Measurement) -> xr.Dataset:
         "ambient_faces": " ".join(measurement.ambient_faces),
     }
     if measurement.ambient_region is not None:
-        dataset.attrs["ambient_region"] = " ".join(["box", *(f"{x:.9g}" for x in measurement.ambient_region)])
+        dataset.attrs["ambient_region"] = " ".join(["box", *(repr(float(x)) for x in measurement.ambient_region)])
     if measurement.bodies:
         dataset["body_name"] = (("body",), np.array([body.name for body in measurement.bodies], dtype=object))
     if not pinholes:

@@ -283,7 +283,7 @@ def _bend(
 def hidden_pixels(camera: Camera, bodies: Sequence[Body], margin: int = 0, step: int = 1) -> Bool[Tensor, "row column"]:
     """Return the pixels of a camera that see a body, with any part of their lens or window.
 
-    A body so thin that no pixel sees it with its centre hides those that see it with a corner.
+    A body so thin that no pixel sees it with its centre hides the pixels on which it lies.
 
     Parameters
     ----------
@@ -291,17 +291,17 @@ def hidden_pixels(camera: Camera, bodies: Sequence[Body], margin: int = 0, step:
     step : rows and columns from one pixel of the result to the next
     """
     pixels = camera.pixel_grid()[::step, ::step]
-    hidden = _seen(camera, bodies, pixels)
-    if not bool(hidden.any()):
-        half = pixels.new_tensor([(-0.5, -0.5), (-0.5, 0.5), (0.5, -0.5), (0.5, 0.5)])
-        hidden = torch.stack([_seen(camera, bodies, pixels + shift) for shift in half]).any(dim=0)
+    hidden = torch.zeros(pixels.shape[:2], dtype=torch.bool)
+    for body in bodies:
+        of_body = _seen(camera, body, pixels)
+        hidden |= of_body if bool(of_body.any()) else _touched(camera, body, pixels.shape[:2], step)
     if margin:
         grown = torch.nn.functional.max_pool2d(hidden[None].float(), 2 * margin + 1, 1, margin)
         hidden = grown[0] > 0
     return hidden
 
 
-def _seen(camera: Camera, bodies: Sequence[Body], pixels: Float[Tensor, "row column 2"]) -> Bool[Tensor, "row column"]:
+def _seen(camera: Camera, body: Body, pixels: Float[Tensor, "row column 2"]) -> Bool[Tensor, "row column"]:
     """Which pixels see a body with any part of their lens or window."""
     hidden = torch.zeros(pixels.shape[:2], dtype=torch.bool)
     each = LENS_RAYS if camera.lens is not None and (camera.lens.diameter > 0 or camera.lens.window > 0) else 1
@@ -309,12 +309,27 @@ def _seen(camera: Camera, bodies: Sequence[Body], pixels: Float[Tensor, "row col
     for first in range(0, len(pixels), rows):
         part = pixels[first : first + rows]
         rays = camera.rays(part.reshape(-1, 2))
-        bundles = [rays] if each == 1 else [rays, rays.spread(each)]
-        for body in bodies:
-            for bundle in bundles:
-                hit = body.hits(bundle).isfinite().reshape(*part.shape[:2], -1).any(dim=-1)
-                hidden[first : first + rows] |= hit
+        for bundle in [rays] if each == 1 else [rays, rays.spread(each)]:
+            hit = body.hits(bundle).isfinite().reshape(*part.shape[:2], -1).any(dim=-1)
+            hidden[first : first + rows] |= hit
     return hidden
+
+
+def _touched(camera: Camera, body: Body, shape: tuple[int, ...], step: int) -> Bool[Tensor, "row column"]:
+    """The pixels on which the surface of a body lies."""
+    width = float(camera.pixel_size(body.vertices.mean(dim=0)[None])[0])
+    points, _, _ = fine_triangles(body, width / 2)
+    pixels = camera.project(points)
+    column, row = (pixels / step).round().nan_to_num(-1).long().unbind(-1)
+    inside = (row >= 0) & (row < shape[0]) & (column >= 0) & (column < shape[1])
+    points, row, column = points[inside], row[inside], column[inside]
+    rays = camera.rays(pixels[inside].to(camera.intrinsics.dtype))
+    length = ((points - rays.origin) * rays.direction).sum(dim=-1)
+    end = torch.full_like(length, torch.inf) if rays.background is None else rays.background.distance
+    before = (length > rays.begin) & (length < end)
+    touched = torch.zeros(shape[0], shape[1], dtype=torch.bool)
+    touched[row[before], column[before]] = True
+    return touched
 
 
 def orientations() -> Iterator[tuple[str, Matrix3]]:

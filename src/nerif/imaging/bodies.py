@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
+from jaxtyping import Bool
 from torch import Tensor
 
 from nerif.common.conventions import InputError
@@ -47,15 +48,30 @@ def with_bodies(
     for body in bodies:
         check_place(body, measurement.box, unit_stated)
         _check_silhouette(measurement, body)
-    hidden = torch.zeros(measurement.shape, dtype=torch.bool)
+    each = _hidden(measurement, bodies, margin, on_view)
+    for body, hidden in zip(bodies, each, strict=True):
+        if not bool(hidden.any()):
+            raise InputError("no pixel sees it; check its place, and that the views show it", field=body.name)
+    return _hide(measurement, bodies, each)
+
+
+def _hidden(
+    measurement: Measurement, bodies: Sequence[Body], margin: int,
+    on_view: Callable[[int, int], object] = lambda done, count: None,
+) -> Bool[Tensor, "body view row column"]:  # fmt: skip
+    """The pixels that each body hides."""
+    hidden = torch.zeros(len(bodies), *measurement.shape, dtype=torch.bool)
     for i, camera in enumerate(measurement.cameras):
         height, width = camera.image_size
-        hidden[i, :height, :width] = hidden_pixels(camera, bodies, margin)
+        for of_body, body in zip(hidden, bodies, strict=True):
+            of_body[i, :height, :width] = hidden_pixels(camera, [body], margin)
         on_view(i + 1, len(measurement.cameras))
-    if not bool(hidden.any()):
-        raise InputError(
-            "no pixel sees it; check its place, and that the views show it", field=" and ".join(b.name for b in bodies)
-        )
+    return hidden
+
+
+def _hide(measurement: Measurement, bodies: Sequence[Body], each: Bool[Tensor, "body view row column"]) -> Measurement:
+    """Return a measurement without data at the pixels that bodies hide."""
+    hidden = each.any(dim=0)
     for i in hidden.flatten(1).all(dim=1).nonzero().flatten().tolist():
         raise InputError("every pixel sees a body; leave the view out", field=f"view '{measurement.names[i]}'")
     values = {o.technique.name: o.values.masked_fill(hidden[..., None], torch.nan) for o in measurement.observations}
@@ -104,21 +120,32 @@ def film_with_bodies(
         before
     on_frame : called with the numbers of frames done and of all
     """
-    whole: MeasurementSequence | None = None
+    like = film.fullest()
+    if like.bodies:
+        names = ", ".join(body.name for body in like.bodies)
+        raise InputError(
+            f"expected a film without bodies, got one with {names}; start from that before", field=film.path
+        )
     moving, last = poses is not None or refine, list(bodies)
+    nothing = torch.zeros(like.shape, dtype=torch.bool)
+    at_rest = replace(like, bodies=tuple(bodies), hidden=nothing)
+    whole = MeasurementSequence.create(out, film.times, at_rest, force, moving)
+    first = True
     for index in range(len(film)):
-        frame = film.frame(index)
+        try:
+            frame = film.frame(index)
+        except InputError:
+            continue  # a frame that is missing stays so
         here = [b.moved(*pose) for b, pose in zip(bodies, poses[index], strict=True)] if poses is not None else last
         if refine:
             here = [refine_pose(frame, body, margin=margin).body for body in here]
         last = here
-        frame = with_bodies(frame, here, margin, unit_stated)
-        if whole is None:
-            at_rest = replace(frame, bodies=tuple(bodies))
-            whole = MeasurementSequence.create(out, film.times, at_rest, force, moving)
+        frame = (
+            with_bodies(frame, here, margin, unit_stated) if first else _hide(frame, here, _hidden(frame, here, margin))
+        )
+        first = False
         whole.write_frame(index, frame, [_pose(a, b) for a, b in zip(bodies, here, strict=True)] if moving else None)
         on_frame(index + 1, len(film))
-    assert whole is not None
     return whole
 
 

@@ -158,7 +158,8 @@ def flow_mask(
 
 
 def drawn_masks(
-    folder: Path, names: Iterable[str], say: Callable[[str], None] = lambda line: None
+    folder: Path, names: Iterable[str], say: Callable[[str], None] = lambda line: None,
+    otherwise: str = "masks by threshold",
 ) -> dict[str, Path]:  # fmt: skip
     """Return the images of masks in a folder, VIEW.png and similar, by the names of their views.
 
@@ -167,6 +168,7 @@ def drawn_masks(
     Parameters
     ----------
     say : called with a line about files that fit no view, and about views without a drawing
+    otherwise : what happens to these views
     """
     if not folder.is_dir():
         raise InputError("no such folder; expected one with VIEW.png for each view", field=folder)
@@ -185,7 +187,7 @@ def drawn_masks(
     if not masks:
         raise InputError(f"expected images with the names of the views, {', '.join(names)}, got none", field=folder)
     if missing := [name for name in names if name not in masks]:
-        say(f"{folder}: no drawing of {', '.join(missing)}; masks by threshold")
+        say(f"{folder}: no drawing of {', '.join(missing)}; {otherwise}")
     return masks
 
 

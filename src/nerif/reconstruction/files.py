@@ -74,6 +74,7 @@ def fingerprint(measurement: Measurement, open_faces: tuple[str, ...] = ()) -> d
         "n_ambient": digest([measurement.n_ambient]),
         **{name: digest(values) for name, values in constants.items()},
         "ambient_faces": digest(sorted(measurement.ambient_faces)),
+        **({"ambient_region": digest(measurement.ambient_region)} if measurement.ambient_region else {}),
         "open_faces": digest(sorted(open_faces)),
     }
 

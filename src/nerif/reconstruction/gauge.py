@@ -17,6 +17,7 @@ from torch import Tensor
 
 from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement, Region
+from nerif.data.volume import INDEX
 from nerif.geometry import Box, Grid
 from nerif.geometry.body import Body, contained
 
@@ -36,10 +37,14 @@ def is_open(measurement: Measurement) -> bool:
 def with_gauge(measurement: Measurement, settings: SharedSettings) -> Measurement:
     """Return a measurement with the ambient faces and the ambient region of settings in place of its own.
 
-    Settings that state any of the two, or probes, replace both.
+    Settings that state any of the two, or probes, replace both. The faces of the measurement itself count only if a
+    technique needs them.
     """
     if not (settings.ambient_faces or settings.ambient_region or settings.probes):
-        return measurement
+        faces = ambient_faces(measurement)
+        return measurement if faces == measurement.ambient_faces else replace(measurement, ambient_faces=faces)
+    if settings.probes and measurement.quantity != INDEX:
+        raise InputError(f"expected none for {measurement.quantity}, got points with an index", field="probes")
     return replace(measurement, ambient_faces=settings.ambient_faces, ambient_region=settings.ambient_region)
 
 
@@ -56,7 +61,7 @@ def check_gauge(measurement: Measurement, probes: bool = False, hull: bool = Tru
     probes : whether it is known at points
     hull : whether it is ambient outside the flow masks
     """
-    faces, region = ambient_faces(measurement), measurement.ambient_region is not None
+    faces, region = measurement.ambient_faces, measurement.ambient_region is not None
     masks = hull and measurement.flow_mask is not None
     if is_open(measurement) and not (faces or region or probes or masks):
         raise InputError(
@@ -143,12 +148,13 @@ class Gauge:
 
     @classmethod
     def of(
-        cls, measurement: Measurement, probes: Sequence[tuple[float, float, float, float]] = (), resolution: int = 48
-    ) -> Gauge | None:
+        cls, measurement: Measurement, probes: Sequence[tuple[float, float, float, float]] = (), hull: bool = True,
+        resolution: int = 48,
+    ) -> Gauge | None:  # fmt: skip
         """Return the gauge of a measurement, and of probes x y z (mm) with the index there; None if not needed."""
-        faces, grid = ambient_faces(measurement), Grid.of_resolution(measurement.box, resolution)
+        faces, grid = measurement.ambient_faces, Grid.of_resolution(measurement.box, resolution)
         empty = torch.zeros(0, 3)
-        if measurement.flow_mask is not None:
+        if hull and measurement.flow_mask is not None:
             empty = grid.points()[_outside(measurement, _flow(measurement), grid)]
         check_gauge(measurement, bool(probes), bool(len(empty)))
         table = torch.tensor(probes, dtype=torch.float64).reshape(-1, 4)
@@ -195,7 +201,7 @@ class Gauge:
 def _check_points(measurement: Measurement, points: Float[Tensor, "k 3"]) -> None:
     """Raise InputError for a probe that is outside the box or within a body."""
     lower, upper = measurement.box.lower, measurement.box.upper
-    outside = ((points < points.new_tensor(lower)) | (points > points.new_tensor(upper))).any(dim=-1)
+    outside = ~((points >= points.new_tensor(lower)) & (points <= points.new_tensor(upper))).all(dim=-1)  # or NaN
     within = contained(measurement.bodies, points)
     for wrong, where in ((outside, f"outside the box {lower} to {upper} mm"), (within, "within a body")):
         if bool(wrong.any()):

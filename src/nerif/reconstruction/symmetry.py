@@ -23,7 +23,7 @@ from torch import Tensor
 from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
 from nerif.geometry.symmetry import Axis, Symmetry, parse_symmetry
-from nerif.reconstruction.gauge import ambient_faces, with_gauge
+from nerif.reconstruction.gauge import with_gauge
 from nerif.reconstruction.gauss_newton import AdaptingField, Information
 from nerif.reconstruction.shared_settings import SharedSettings
 from nerif.reconstruction.sources import of_source
@@ -178,8 +178,7 @@ def axis_of(settings: SharedSettings, measurement: Measurement) -> Axis | None:
     if not symmetry.axial or not any(sigma):
         return Axis(symmetry, (0.0,) * 4, (0.0,) * 4, (0.0,) * 4, math.nan)
     data = with_gauge(of_source(measurement, "auto", preferred="displacements"), settings)
-    faces = ambient_faces(data)
-    return find_axis(data, symmetry, sigma, faces, settings.open_faces)
+    return find_axis(data, symmetry, sigma, data.ambient_faces, settings.open_faces)
 
 
 def with_axis(settings: AnySettings, symmetry: Symmetry) -> AnySettings:

@@ -33,7 +33,6 @@ from nerif.reconstruction.shared_settings import SharedSettings
 from nerif.reconstruction.sources import check_source
 from nerif.reconstruction.symmetry import axis_of, with_axis
 from nerif.reconstruction.uncertainty.bootstrap import KINDS, Trials
-from nerif.reconstruction.voxels.settings import VoxelReconstructor
 from nerif.results.directory import ResultDirectory
 from nerif.results.live import Live
 from nerif.results.metrics import DetailEntries
@@ -156,7 +155,7 @@ def grown(measurement: Measurement, reconstructor: Reconstructor, length: float)
         raise InputError("expected open faces through which the box grows (--open-faces), got none", field="grow")
     box = measurement.box.grown(faces, length)
     changes: dict[str, Any] = {"open_faces": ()}
-    if isinstance(reconstructor, VoxelReconstructor):  # of the same size
+    if hasattr(reconstructor, "voxels"):  # of the same size
         changes["voxels"] = round(reconstructor.voxels * max(box.edges) / max(measurement.box.edges))
     ambient = tuple(face for face in measurement.ambient_faces if face not in faces)
     measurement = replace(measurement, box=box, ambient_faces=ambient)

@@ -84,7 +84,7 @@ class CrossValidate(PipelineStep):
             return
         job.initial, job.method = short.field, job.reconstructor.in_two()[1]
         if short.outcome.reason == "interrupted":
-            job.result = replace(short, state=None)
+            job.result = replace(short, state=None, box=job.inputs.box)
             job.measurement, job.withheld = job.validation.data, (job.validation.view,)
 
 

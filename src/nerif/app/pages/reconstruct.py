@@ -27,11 +27,11 @@ from nerif.reconstruction.neural.presets import PRESETS, preset
 
 __all__ = ["PAGE"]
 
-WITHOUT = ("config", "measurement", "out", "method", "preset", "force", "resume", "live")
+WITHOUT = ("config", "measurement", "out", "method", "preset", "force", "resume", "live", "probes")
 MAIN = ("time_limit", "withhold", "uncertainty", "voxels")
 FILM = ".zarr"
 VALUES = {False: "values", True: "film_values"}  # key of the settings in the draft: of one instant, of a film
-FILM_WITHOUT = ("config", "measurement", "out", "preset", "force", "time_limit", "refine")
+FILM_WITHOUT = ("config", "measurement", "out", "preset", "force", "time_limit", "refine", "probes")
 FILM_MAIN = ("cluster", "workers", "chunk", "withhold", "voxels")
 
 

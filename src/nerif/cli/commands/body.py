@@ -72,12 +72,7 @@ def run(settings: BodyInFlow) -> Measurement:
         raise InputError(f"expected the measurement to write, NAME{ending}, got none", field="out")
     image = out.with_suffix(".bodies.png")
     check_output(out, settings.force, image, endings=(ending,))
-    if bool(settings.models or settings.silhouettes) == settings.remove:
-        raise InputError("expected the files of one or more models, silhouettes, or --remove", field="models")
-    if settings.refine and not settings.models:
-        raise InputError("expected a model whose pose to refine, got none", field="refine")
-    if not film and settings.poses is not None:
-        raise InputError("expected a film (.zarr) for moving models, got a measurement", field="poses")
+    _check(settings, film)
     measurement = MeasurementSequence.read(settings.measurement).fullest() if film else None
     measurement = measurement or Measurement.read(settings.measurement)
     if settings.remove:
@@ -107,11 +102,35 @@ def run(settings: BodyInFlow) -> Measurement:
     return measurement
 
 
+def _check(settings: BodyInFlow, film: bool) -> None:
+    """Raise InputError for options that do not go together."""
+    assert settings.out is not None
+    if bool(settings.models or settings.silhouettes or settings.poses) == settings.remove:
+        raise InputError("expected the files of one or more models, silhouettes, or --remove", field="models")
+    if not settings.models and (settings.refine or settings.poses or any((*settings.rotation, *settings.translation))):
+        raise InputError("expected a model to which the pose belongs, got none", field="models")
+    if settings.models and settings.silhouettes and not settings.refine:
+        raise InputError("expected --refine with a model, or no model for the visual hull", field="silhouettes")
+    if not film:
+        if settings.poses is not None:
+            raise InputError("expected a film (.zarr) for moving models, got a measurement", field="poses")
+        return
+    if settings.out.resolve() == settings.measurement.resolve():
+        raise InputError("expected another name than that of the film, which is read frame by frame", field="out")
+    if settings.remove or settings.silhouettes:
+        option = "remove" if settings.remove else "silhouettes"
+        raise InputError("expected a measurement (.nc), got a film; start from the film without bodies", field=option)
+    if settings.refine and settings.poses:
+        raise InputError("expected either --refine or --poses, got both", field="poses")
+
+
 def _bodies(settings: BodyInFlow, measurement: Measurement) -> list[Body]:
     """The bodies of the files at their pose, or that of the silhouettes."""
     silhouettes = None
     if settings.silhouettes is not None:
-        silhouettes = drawn_silhouettes(drawn_masks(settings.silhouettes, measurement.names), measurement)
+        silhouettes = drawn_silhouettes(
+            drawn_masks(settings.silhouettes, measurement.names, say, "it counts for nothing"), measurement
+        )
     if not settings.models:
         assert silhouettes is not None
         return [hull_of_silhouettes(measurement, silhouettes)]
@@ -123,7 +142,7 @@ def _bodies(settings: BodyInFlow, measurement: Measurement) -> list[Body]:
         body = read.moved(rotation, translation)
         if settings.refine and settings.measurement.suffix != ".zarr":
             check_place(body, measurement.box, settings.unit is not None)
-            pose = refine_pose(measurement, body, silhouettes, settings.margin)
+            pose = refine_pose(measurement, body, silhouettes, 0 if silhouettes is not None else settings.margin)
             say(pose.sentence)
             body = pose.body
         bodies.append(body)

@@ -64,7 +64,7 @@ class Original:
     @cached_property
     def volume(self) -> Volume:
         """The field on VOXELS voxels along the longest edge."""
-        return replace(self.result, bodies=()).volume(Grid.of_resolution(self.result.box, VOXELS))
+        return replace(self.result, bodies=()).volume(Grid.of_resolution(self.measurement.box, VOXELS))
 
     @cached_property
     def projections(self) -> Maps:

@@ -89,9 +89,9 @@ class Descent:
         finest = grids[-1]
         self._check_memory(finest.shape, settings.memory_bytes(measurement, finest, self.device.type))
         self.free = self.layout.free(measurement, finest, settings.hull)
-        self.gauge = self._gauge()
         bounds = field_bounds(measurement, settings.lower, settings.upper)
         self.bounds = bounds if any(map(math.isfinite, bounds)) else None
+        self.gauge = self._gauge()
         self.finest_target = self._target(self.levels[-1].edge)
         self.scale = self.finest_target.scale
         self.history: list[dict[str, float]] = []
@@ -133,9 +133,11 @@ class Descent:
                 "field to them; leave one of the two out, or take --method nerif",
                 field="probes",
             )
-        if pinned or not is_open(self.measurement):
+        if self.settings.probes and self.bounds is not None:
+            raise InputError("expected no bounds beside probes for a voxel method, got some", field="probes")
+        if pinned or self.bounds is not None or not is_open(self.measurement):
             return None
-        return Gauge.of(self.measurement, self.settings.probes)
+        return Gauge.of(self.measurement, self.settings.probes, self.settings.hull)
 
     # -- levels ----------------------------------------------------------------------------------------------------
 

@@ -18,7 +18,7 @@ from nerif.fields.symmetric import SymmetricVoxels
 from nerif.forward.base import ForwardModel
 from nerif.geometry import Box, Grid, Rays
 from nerif.geometry.symmetry import Axis, Symmetry
-from nerif.reconstruction.gauge import ambient_faces, free_voxels
+from nerif.reconstruction.gauge import free_voxels
 from nerif.reconstruction.voxels.operator import VoxelOperator
 from nerif.reconstruction.voxels.symmetric_operator import SymmetricOperator
 
@@ -88,9 +88,8 @@ def layout_of(
     measurement: Measurement, axis: Axis | None, basis: str = "cubic", step: float | None = None,
     device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32,
 ) -> Layout:  # fmt: skip
-    """Return the layout for a measurement."""
-    faces = ambient_faces(measurement)
-    common: dict[str, Any] = {"box": measurement.box, "faces": faces, "basis": basis, "step": step}
+    """Return the layout for a measurement with its gauge (with_gauge)."""
+    common: dict[str, Any] = {"box": measurement.box, "faces": measurement.ambient_faces, "basis": basis, "step": step}
     common |= {"device": device, "dtype": dtype}
     return Symmetric(symmetry=axis.symmetry, **common) if axis else InSpace(**common)
 

@@ -14,6 +14,7 @@ from nerif.common.files import write_json
 from nerif.data.volume import INDEX
 from nerif.data.volume_sequence import VolumeSequence
 from nerif.forward.registry import ASSUMED, technique
+from nerif.geometry.body import contained
 from nerif.workflow.sequence.store import DONE, SequenceStore
 
 __all__ = ["evaluate_sequence"]
@@ -44,6 +45,8 @@ def evaluate_sequence(
         expected = true.volume(i, quantity)
         if quantity == INDEX:
             expected = expected.relative_to(store.n_ambient)
+        if bodies := store.bodies(i):
+            expected = expected.masked(contained(bodies, true.grid.points()), "within a body")
         errors = volume_errors(expected.values.numpy(), store.field(i).sample(true.grid).numpy(), reference)
         frames.append({"frame": i, "time_s": store.times[i], **errors})
         on_frame(len(frames), len(complete))

@@ -205,7 +205,8 @@ class SequenceStore(VolumeSequence):
         for name, new in json.loads(json.dumps(attributes)).items():
             old = self.attributes.get(name)
             if isinstance(new, dict) and isinstance(old, dict):
-                key = next((key for key in new if new[key] != old.get(key)), None)
+                # a store of an earlier version lacks later settings, which are empty by default
+                key = next((k for k in new if new[k] != old.get(k) and (k in old or new[k])), None)
                 name, old, new = (name, None, None) if key is None else (key, old.get(key), new[key])
             if old != new:
                 raise InputError(
