@@ -14,8 +14,8 @@ if TYPE_CHECKING:
 
 __all__ = ["draw_surface"]
 
-SIDES = (("azimuth −60°", -60.0), ("azimuth 120°", 120.0))
-ELEVATION = 22.0
+SIDES = (("from above, azimuth −60°", 22.0, -60.0), ("from below, azimuth 120°", -22.0, 120.0))
+FLAT = 0.15  # of the longest edge, below which an axis has a single tick
 UNKNOWN = "0.75"  # grey of triangles without a value
 
 
@@ -34,7 +34,7 @@ def draw_surface(figure: Figure, surface: SurfaceMap, quantity: str) -> None:
     colours = scale.to_rgba(np.ma.masked_invalid(values))
     lower, upper = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
     every: Any = figure.subplots(1, 2, subplot_kw={"projection": "3d"})
-    for axes, (title, azimuth) in zip(every, SIDES, strict=True):
+    for axes, (title, elevation, azimuth) in zip(every, SIDES, strict=True):
         axes.add_collection3d(
             Poly3DCollection(corners, facecolors=colours, edgecolors=colours, linewidths=0.2, rasterized=True)
         )
@@ -42,8 +42,11 @@ def draw_surface(figure: Figure, surface: SurfaceMap, quantity: str) -> None:
         axes.set(xlabel="x [mm]", ylabel="y [mm]", zlabel="z [mm]", title=title)
         axes.set_box_aspect(np.maximum(upper - lower, 1e-9), zoom=0.9)
         axes.set_proj_type("ortho")
-        axes.view_init(ELEVATION, azimuth)
+        axes.view_init(elevation, azimuth)
         axes.tick_params(labelsize=6)
-        for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
-            axis.set_major_locator(MaxNLocator(4))
+        for axis, low, high in zip((axes.xaxis, axes.yaxis, axes.zaxis), lower, upper, strict=True):
+            if high - low > FLAT * float((upper - lower).max()):
+                axis.set_major_locator(MaxNLocator(4))
+            else:
+                axis.set_ticks([float(f"{(low + high) / 2:.3g}")])
     figure.colorbar(scale, ax=list(every), label=label_of(quantity), shrink=0.7, pad=0.08)
