@@ -63,6 +63,7 @@ REQUIRED = ("intrinsics", "rotation", "translation", "box")
 BACKGROUND = ("background_normal", "background_offset")
 SIZES = {"i": 3, "j": 3, "coefficient": 5, "axis": 2, "corner": 2, "side": 2, "parameter": 6, "body_corner": 3}
 SPELLINGS = {"px/mm": "px mm-1"}
+ROTATION = 1e-4  # of a product of orthonormal columns, from 0 and 1
 MAX_PIXELS = 1 << 32  # of all views; a damaged file may claim any number
 
 
@@ -249,6 +250,9 @@ def bodies_of(arrays: Mapping[str, np.ndarray], names: Sequence[str] = ()) -> tu
     translations = torch.from_numpy(arrays.get("body_translation", np.zeros((count, 3))))
     if len(rotations) != count or len(translations) != count:
         raise InputError(f"expected a pose for each of {count} bodies", field="variable 'body_rotation'")
+    product = rotations @ rotations.mT - torch.eye(3, dtype=rotations.dtype)
+    if not (float(product.abs().max()) < ROTATION and bool((torch.linalg.det(rotations) > 0).all())):
+        raise InputError("expected rotation matrices, got others", field="variable 'body_rotation'")
     bodies = []
     for i in range(count):
         used, index = faces[number == i].unique(return_inverse=True)

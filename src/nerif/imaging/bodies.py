@@ -102,6 +102,9 @@ def read_poses(path: Path, bodies: int, frames: int) -> list[list[Pose]]:
     if len(rows) != bodies * frames:
         raise InputError(f"expected {bodies * frames} rows for {frames} frames, got {len(rows)}", field=path)
     table = torch.tensor(rows, dtype=torch.float64).reshape(frames, bodies, 6)
+    if not bool(table.isfinite().all()):
+        row = int((~table.isfinite()).flatten(0, 1).any(dim=-1).nonzero()[0])
+        raise InputError(f"expected numbers, got NaN or infinity in row {row + 1}", field=path)
     rotations = rotation_matrix(table[..., :3].deg2rad())
     return [[(r, t) for r, t in zip(*frame, strict=True)] for frame in zip(rotations, table[..., 3:], strict=True)]
 
@@ -137,13 +140,14 @@ def film_with_bodies(
         except InputError:
             continue  # a frame that is missing stays so
         here = [b.moved(*pose) for b, pose in zip(bodies, poses[index], strict=True)] if poses is not None else last
-        if refine:
-            here = [refine_pose(frame, body, margin=margin).body for body in here]
-        last = here
-        frame = (
-            with_bodies(frame, here, margin, unit_stated) if first else _hide(frame, here, _hidden(frame, here, margin))
-        )
-        first = False
+        try:
+            if refine:
+                here = [refine_pose(frame, body, margin=margin).body for body in here]
+            checked = with_bodies(frame, here, margin, unit_stated) if first else None
+            frame = checked or _hide(frame, here, _hidden(frame, here, margin))
+        except InputError as error:
+            raise error.inside(f"{film.path}, frame {index}") from None
+        last, first = here, False
         whole.write_frame(index, frame, [_pose(a, b) for a, b in zip(bodies, here, strict=True)] if moving else None)
         on_frame(index + 1, len(film))
     return whole

@@ -22,7 +22,7 @@ from nerif.data.measurement import Measurement
 from nerif.data.volume import INDEX
 from nerif.fields.base import Field
 from nerif.fields.grid import VoxelField
-from nerif.fields.network import NetworkShape, NeuralField
+from nerif.fields.network import Network, NetworkShape, NeuralField
 from nerif.fields.network_kinds import network_in
 from nerif.fields.sum import SumField
 from nerif.fields.symmetric import SymmetricNetwork, SymmetricVoxels
@@ -228,9 +228,10 @@ def _field_of(tensors: dict[str, Tensor], about: dict[str, Any], box: Box, bodie
         planes = [VoxelField(c, grid, int(about["degree"])) for c in tensors["coefficients"]]
         return SymmetricVoxels(planes, Symmetry.from_entries(about["symmetry"]))
     shape = NetworkShape.of(about["network"])
-    network = network_in(box, shape, bodies=bodies if about.get("walls") else ())
     if "symmetry" in about:  # in network coordinates
-        network = SymmetricNetwork(shape, Symmetry.from_entries(about["symmetry"]))
+        network: Network = SymmetricNetwork(shape, Symmetry.from_entries(about["symmetry"]))
+    else:
+        network = network_in(box, shape, bodies=bodies if about.get("walls") else ())
     network.load_state_dict(tensors)
     network.eval().requires_grad_(False)
     return NeuralField(network, box, float(about["index_scale"]), float(about["offset"]))

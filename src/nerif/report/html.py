@@ -72,6 +72,7 @@ def render(result: Result) -> str:
         first_run=summary.cross_validated(result),
         plane=_plane(meridian),
         plane_title="Around the axis" if meridian is None or meridian.axial else "In the plane of the flow",
+        surface=_surface(result),
         curves=_curves(result),
         assumptions=[
             (name_of(q).capitalize(), result.volumes[q].notes)
@@ -129,6 +130,15 @@ def _plane(meridian: Meridian | None) -> list[tuple[str, str]]:
     ]
 
 
+def _surface(result: Result) -> tuple[str, str] | None:
+    """Title and image of the first quantity on the surface of bodies, of an index the density; None without any."""
+    if result.surface is None:
+        return None
+    quantity = next(iter(result.surface.quantities))
+    title = f"{name_of(quantity).capitalize()} on the surface of the bodies"
+    return title, image(partial(draw_surface, surface=result.surface, quantity=quantity), 9, 4.2, 10)
+
+
 def _curves(result: Result) -> list[tuple[str, str]]:
     """Titles and images of convergence, residuals, rig and accuracy."""
     metrics = result.metrics
@@ -137,10 +147,6 @@ def _curves(result: Result) -> list[tuple[str, str]]:
     def add(title: str, draw: Callable[..., object], *data: Any) -> None:
         curves.append((title, svg(lambda axes: draw(axes, *data))))
 
-    if result.surface is not None:
-        quantity = next(iter(result.surface.quantities))  # the density, of an index
-        title = f"{name_of(quantity).capitalize()} on the surface of the bodies"
-        curves.append((title, image(partial(draw_surface, surface=result.surface, quantity=quantity), 7, 3.6, 10)))
     if result.history:
         add("Convergence", figures.draw_history, result.history)
     if result.reprojection is not None:

@@ -86,10 +86,12 @@ class MixedPrecision:
         tf32 = device.type == "cuda" and precision != "float32"
         self.products: Literal["highest", "high"] = "high" if tf32 else "highest"
         self.remark = ""
-        """Why compilation failed."""
+        """Why the network is not compiled."""
         self.evaluate: Evaluation = network.value_and_gradient
         if network.compilable and (compile == "on" or (compile == "auto" and device.type == "cuda")):
             self.evaluate = self._compiled(network.value_and_gradient)
+        elif compile == "on":
+            self.remark = "; a network beside thin bodies is not compiled"
         self.fused: Callable[[Network, Tensor], tuple[Tensor, Tensor]] | None = None
         if compile == "auto" and device.type == "cpu" and _fusible(network):
             from nerif.reconstruction.neural.fused import value_and_gradient
