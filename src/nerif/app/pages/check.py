@@ -72,14 +72,17 @@ class CheckPage:
             with ui.element("div").classes("stack"):
                 with card("Findings"):
                     self.findings = ui.element("div").classes("stack").props('aria-live="polite"')
+                with card("Outlines of the model") as self.outline_card:
+                    self.outlines = ui.element("div")
                 with card("Undone") as self.correction:
                     self.correction_status = JobStatus(work, f"{PAGE.name}.undone", on_continue=self.choice.choose)
         self.correction.set_visibility(bool(self.correction_status.job))
+        self._show_outlines()
         self.show()
 
     def _build_model(self, models: Sequence[str]) -> None:
-        """The form that adds a body to the measurement, and a figure of its outlines."""
-        self.outlines: ui.element | None = None
+        """The form that adds a body to the measurement."""
+        self.body: JobForm | None = None
         if not models:
             text_html(NO_MODEL, classes="status")
             return
@@ -90,8 +93,6 @@ class CheckPage:
             work, f"{PAGE.name}.body.form", Form(BodyInFlow(Path()), only=MODEL_SETTINGS), self._body_words,
             "Add the model", out=self._with_model, on_end=self._on_body,
         )  # fmt: skip
-        self.outlines = ui.element("div")
-        self._show_outlines()
 
     def _with_model(self) -> str:
         """The measurement with the model, in place of an earlier one."""
@@ -102,17 +103,17 @@ class CheckPage:
 
     def _on_model(self) -> None:
         self.work.keep(f"{PAGE.name}.body", {"model": self.model.name})
+        assert self.body is not None
         self.body.show()
 
     async def _on_body(self, job: Job) -> None:
         self._show_outlines()
 
     def _show_outlines(self) -> None:
-        """Show the outlines of the model over the measured values."""
-        if self.outlines is None:
-            return
+        """Show the outlines of the model over the measured values, once there is a measurement with it."""
         figure = self.work.project.path(self._with_model().removesuffix(".nc") + ".bodies.png")
         self.outlines.clear()
+        self.outline_card.set_visibility(figure.is_file())
         if figure.is_file():
             with self.outlines, Image.open(figure) as image:
                 ui.image(image.copy()).props('alt="Outlines of the model in each view"')
@@ -131,9 +132,9 @@ class CheckPage:
         self.correction.set_visibility(bool(self.correction_status.job))
         self.views.show()
         self.rig.show()
-        if self.outlines is not None:
+        if self.body is not None:
             self.body.show()
-            self._show_outlines()
+        self._show_outlines()
         self.show()
 
     async def _on_end(self, job: Job) -> None:
