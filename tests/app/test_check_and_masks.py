@@ -271,6 +271,7 @@ def test_a_model_is_added(browser, server, folder):
     opened(browser, server, "check", LINE)
     click(browser, "Add the model")
     (added,) = written(folder / "bad.body.nc").bodies
+    assert ended(Jobs(folder), 60).state == "done"
     assert added.name == "ball"
     wait_for(browser, 'return document.querySelector(\'[alt^="Outlines"] img, img[alt^="Outlines"]\') !== null', 30)
     for name in ("ball.stl", "bad.body.nc", "bad.body.bodies.png"):
