@@ -17,6 +17,7 @@ from nerif.data.exports import export
 from nerif.data.kinds import Kind, check_kind, kind_of
 from nerif.data.measurement import Measurement
 from nerif.data.measurement_sequence import MeasurementSequence
+from nerif.data.velocity_sequence import VelocitySequence
 from nerif.data.volume import Volume
 from nerif.data.volume_file import read_volume
 from nerif.data.volume_sequence import VolumeSequence
@@ -31,6 +32,7 @@ from nerif.workflow.sequence.store import SequenceStore
 FILES = {
     "m.nc": kinds.MEASUREMENT, "volume.nc": kinds.VOLUME, "volume.vti": kinds.VOLUME, "result": kinds.RESULT,
     "films.zarr": kinds.SEQUENCE, "truth.zarr": kinds.TRUE_SEQUENCE, "store.zarr": kinds.SEQUENCE_RESULT,
+    "velocity.zarr": kinds.VELOCITY,
     "lab": kinds.EXPERIMENT, "listed": kinds.EXPERIMENT, "lab/cam1": kinds.VIEW, "listed/views.toml": kinds.VIEWS,
     "lab/cam1/flow": kinds.IMAGES, "lab/cam1/flow/1.TIF": kinds.IMAGES, "d.npy": kinds.ARRAYS,
     "calibration.toml": kinds.CALIBRATION, "result/run.toml": kinds.SETTINGS,
@@ -49,10 +51,11 @@ COMMANDS: dict[str, tuple[Kind, ...]] = {
     "evaluate result --measurement {}": (kinds.MEASUREMENT,),
     "evaluate store.zarr --truth {}": STORES,
     "sequence {} -o new.zarr": (kinds.SEQUENCE,),
-    "movie {} -o new.gif": STORES,
-    "report {} -o new.html": (kinds.RESULT, *STORES),
+    "velocity {} -o new.zarr": STORES,
+    "movie {} -o new.gif": (*STORES, kinds.VELOCITY),
+    "report {} -o new.html": (kinds.RESULT, *STORES, kinds.VELOCITY),
     "figures {} -o new": (kinds.RESULT,),
-    "export {} -o new.csv": (kinds.RESULT,),
+    "export {} -o new.csv": (kinds.RESULT, *STORES, kinds.VELOCITY),
 }
 
 
@@ -71,6 +74,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory, measurement: Any, ball: Any
     films = MeasurementSequence.create(out / "films.zarr", [0.0, 0.1], measurement)
     films.write_frame(0, measurement)
     VolumeSequence.create(out / "truth.zarr", [0.0, 0.1], grid, ["index_excess"], 1.00027)
+    VelocitySequence.begin(out / "velocity.zarr", [0.0, 0.1], grid, [], {})
     SequenceStore.begin(out / "store.zarr", films, grid, ["index_excess"], NetworkShape(width=8, depth=2), {})
     for source in ("reference", "flow"):
         (out / "lab" / "cam1" / source).mkdir(parents=True)

@@ -25,6 +25,7 @@ COMMANDS = {
     "project": "predict the measurement of any camera from a reconstruction",
     "evaluate": "compare a reconstruction with a true field, or with measured views",
     "sequence": "reconstruct all frames of a measurement sequence, on one machine or a cluster",
+    "velocity": "compute velocity and pressure from the densities of a film",
     "movie": "draw volumes over time as isosurface or slices (.mp4, .gif)",
     "report": "write an HTML report of a result",
     "figures": "write the figures of a result as PDF and PNG at journal column widths",

@@ -7,7 +7,7 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ import torch
 from nerif.common.conventions import InputError
 from nerif.common.files import atomic, ending
 from nerif.data.measurement import Measurement
+from nerif.data.velocity_sequence import COMPONENTS, open_volumes
 from nerif.data.volume import Volume
 from nerif.data.volume_file import write_netcdf
 from nerif.data.vti import write_vti
@@ -23,7 +24,7 @@ from nerif.geometry import Grid
 from nerif.geometry.astra import astra_of
 from nerif.geometry.tigre import tigre_of
 
-__all__ = ["FORMATS", "PROGRAMS", "export", "export_geometry", "write_csv", "write_mat", "write_npz"]
+__all__ = ["FORMATS", "PROGRAMS", "export", "export_frame", "export_geometry", "write_csv", "write_mat", "write_npz"]
 
 PROGRAMS = ("astra", "tigre")
 """Programs for whose geometry there is an export."""
@@ -40,8 +41,30 @@ def export(path: str | os.PathLike[str], volumes: list[Volume], force: bool = Fa
     FORMATS[ending(path)](path, volumes)
 
 
+def export_frame(
+    path: str | os.PathLike[str], store: str | os.PathLike[str], frame: int | None, quantities: Sequence[str] = (),
+    force: bool = False,
+) -> int:  # fmt: skip
+    """Write quantities of one frame of volumes over time, and return their number; .vti holds velocity as vectors.
+
+    Parameters
+    ----------
+    frame : from 0
+    quantities : all by default
+    """
+    volumes = open_volumes(store)
+    wanted = quantities or volumes.quantities
+    if frame is None or not 0 <= frame < len(volumes):
+        raise InputError(f"expected 0 to {len(volumes) - 1}, got {'none' if frame is None else frame}", field="frame")
+    export(path, [volumes.volume(frame, name) for name in wanted], force)
+    return len(wanted)
+
+
 def _write_vti(path: str | os.PathLike[str], volumes: list[Volume]) -> None:
-    write_vti(path, {v.quantity: v.values for v in volumes}, volumes[0].grid, _attributes(volumes))
+    arrays = {v.quantity: v.values for v in volumes}
+    if all(name in arrays for name in COMPONENTS):
+        arrays["velocity"] = torch.stack([arrays.pop(name) for name in COMPONENTS])
+    write_vti(path, arrays, volumes[0].grid, _attributes(volumes))
 
 
 def _attributes(volumes: list[Volume]) -> dict[str, float | str]:

@@ -21,8 +21,8 @@ from nerif.forward.registry import TECHNIQUES
 
 __all__ = [
     "ARRAYS", "BOST", "CALIBRATION", "EXPERIMENT", "FIELD", "IMAGES", "MEASUREMENT", "RESULT", "RUN", "SEQUENCE",
-    "SEQUENCE_KIND", "SEQUENCE_RESULT", "TRUE_SEQUENCE", "VOLUME", "Kind", "check_kind", "kind_of",
-    "known_conventions", "reading_as",
+    "SEQUENCE_KIND", "SEQUENCE_RESULT", "TRUE_SEQUENCE", "VELOCITY", "VELOCITY_KIND", "VOLUME", "Kind", "check_kind",
+    "kind_of", "known_conventions", "reading_as",
 ]  # fmt: skip
 
 BOST = ("BOST-1.0", "BOST-1.1", "BOST-1.2")
@@ -31,6 +31,8 @@ RUN, FIELD = "run.toml", "field.safetensors"
 """Settings and field of a result directory."""
 SEQUENCE_KIND = "nerif sequence 1"
 """Attribute `kind` of the result of nerif sequence."""
+VELOCITY_KIND = "nerif velocity 1"
+"""Attribute `kind` of velocities over time."""
 CALIBRATION_MARK = b"nerif-calibration"
 MAX_HEAD = 4096  # bytes of a text in which its mark is searched
 ARRAY_SUFFIXES = (*NUMPY_AND_HDF5, ".mat")  # HDF5 may also be NetCDF-4
@@ -69,6 +71,7 @@ SEQUENCE = Kind("a measurement sequence (.zarr)", "reconstruct its frames: nerif
 SEQUENCE_RESULT = Kind(
     "the result of nerif sequence (.zarr)", "show it: nerif movie {path} -o NAME.mp4 or nerif report {path}"
 )
+VELOCITY = Kind("velocity over time (.zarr)", "show it: nerif movie {path} -o NAME.mp4 or nerif report {path}")
 TRUE_SEQUENCE = Kind(
     "true fields over time (.zarr)",
     "show them: nerif movie {path} -o NAME.mp4, or compare a result: nerif evaluate RESULT.zarr --truth {path}",
@@ -144,6 +147,8 @@ def _of_store(metadata: Path) -> Kind | None:
         return SEQUENCE
     if attributes.get("kind") == SEQUENCE_KIND:
         return SEQUENCE_RESULT
+    if attributes.get("kind") == VELOCITY_KIND:
+        return VELOCITY
     return TRUE_SEQUENCE if "box_lower_mm" in attributes else None
 
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     import xarray as xr
     from matplotlib.figure import Figure
 
-__all__ = ["INDEX", "QUANTITIES", "Volume", "describe", "field_of", "name_of", "quantities_of"]
+__all__ = ["FLOW_QUANTITIES", "INDEX", "QUANTITIES", "Volume", "describe", "field_of", "name_of", "quantities_of"]
 
 QUANTITIES = {
     "index_excess": ("1", "refractive index minus that of the ambient"),
@@ -30,6 +30,18 @@ QUANTITIES = {
     "emission": ("mm-1", "radiance per length"),
 }
 """Unit and long name of the quantities of volumes."""
+
+FLOW_QUANTITIES = {
+    "u": ("m s-1", "velocity along x"),
+    "v": ("m s-1", "velocity along y"),
+    "w": ("m s-1", "velocity along z"),
+    "speed": ("m s-1", "speed"),
+    "vorticity": ("s-1", "magnitude of the vorticity"),
+    "pressure": ("Pa", "pressure relative to its mean"),
+    "transport_residual": ("s-1", "change of density / reference density that the velocity does not explain"),
+    "momentum_residual": ("m s-2", "acceleration that the equation of momentum does not explain"),
+}
+"""Unit and long name of the quantities of a flow."""
 
 INDEX = "index_excess"
 INDEX_QUANTITIES = (INDEX, "n", "density", "temperature")
@@ -54,10 +66,11 @@ def name_of(quantity: str) -> str:
 def describe(quantity: str) -> tuple[str, str]:
     """Return unit and long name of a quantity such as density, or density_std."""
     base, _, statistic = quantity.rpartition("_")
-    if statistic in STATISTICS and base in QUANTITIES:
-        unit, name = QUANTITIES[base]
+    names = QUANTITIES | FLOW_QUANTITIES
+    if statistic in STATISTICS and base in names:
+        unit, name = names[base]
         return "1" if statistic == "certainty" else unit, f"{STATISTICS[statistic]} of {name}"
-    return QUANTITIES.get(quantity, ("1", quantity))
+    return names.get(quantity, ("1", quantity))
 
 
 @dataclass(frozen=True, repr=False)

@@ -6,12 +6,12 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 from nerif.common.conventions import InputError, ambient_index
 from nerif.common.files import atomic
 from nerif.common.netcdf import reading
-from nerif.data.kinds import SEQUENCE_RESULT, TRUE_SEQUENCE, reading_as
+from nerif.data.kinds import SEQUENCE_RESULT, TRUE_SEQUENCE, Kind, check_kind, reading_as
 from nerif.data.measurement_sequence import ZARR_FORMAT, add_frames, check_store, require_zarr
 from nerif.data.volume import Volume, describe, field_of, name_of
 from nerif.data.volume_file import REFERENCES
@@ -56,10 +56,14 @@ def score_names(kinds: Sequence[type[ForwardModel]]) -> dict[type[ForwardModel],
 class VolumeSequence:
     """A Zarr store of volumes on one grid."""
 
+    kinds: tuple[Kind, ...] = (SEQUENCE_RESULT, TRUE_SEQUENCE)
+    """Kinds of stores that the class reads."""
+
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
-        with reading_as(path, SEQUENCE_RESULT, TRUE_SEQUENCE):
+        with reading_as(path, *self.kinds):
             self._open()
+        check_kind(path, *self.kinds)
 
     def _open(self) -> None:
         require_zarr()
@@ -94,7 +98,7 @@ class VolumeSequence:
         quantities: Sequence[str],
         n_ambient: float,
         attributes: Mapping[str, Any] | None = None,
-    ) -> VolumeSequence:
+    ) -> Self:
         """Make an empty store in place of an earlier one.
 
         Parameters

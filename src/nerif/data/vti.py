@@ -25,7 +25,7 @@ ZLIB_LEVEL = 5  # as in VTK
 def write_vti(
     path: str | os.PathLike[str], arrays: dict[str, Tensor], grid: Grid, attributes: dict[str, float | str]
 ) -> None:
-    """Write (z, y, x) arrays as point data of a VTK image, x fastest, lengths in mm, atomically.
+    """Write (z, y, x) arrays, and (3, z, y, x) vectors, as point data of a VTK image, lengths in mm, atomically.
 
     Source: VTK XML file formats, docs.vtk.org (ImageData; appended raw data in blocks compressed by zlib).
     """
@@ -96,10 +96,12 @@ class _Document:
 
     def add_arrays(self, piece: ElementTree.Element, tag: str, arrays: dict[str, Tensor]) -> None:
         """Add an element with arrays of points, the first of which is shown."""
-        points = ElementTree.SubElement(piece, tag, Scalars=next(iter(arrays)))
+        points = ElementTree.SubElement(piece, tag, Scalars=next(name for name, a in arrays.items() if a.ndim < 4))
         for name, values in arrays.items():
-            size = values.element_size()
-            self.add(points, "DataArray", {4: "Float32", 8: "Float64"}[size], name, _bytes(values, f"<f{size}"))
+            size, more = values.element_size(), {}
+            if values.ndim == 4:
+                values, more = values.movedim(0, -1), {"NumberOfComponents": "3"}
+            self.add(points, "DataArray", {4: "Float32", 8: "Float64"}[size], name, _bytes(values, f"<f{size}"), **more)
 
     def write(self, path: str | os.PathLike[str]) -> None:
         """Write the file atomically."""

@@ -68,6 +68,14 @@ LABELS = {
     "temperature": ("temperature", "K"),
     "extinction": ("extinction coefficient", "mm⁻¹"),
     "emission": ("radiance per length", "mm⁻¹"),
+    "u": ("velocity along x", "m s⁻¹"),
+    "v": ("velocity along y", "m s⁻¹"),
+    "w": ("velocity along z", "m s⁻¹"),
+    "speed": ("speed", "m s⁻¹"),
+    "vorticity": ("vorticity", "s⁻¹"),
+    "pressure": ("pressure", "Pa"),
+    "transport_residual": ("residual of transport", "s⁻¹"),
+    "momentum_residual": ("residual of momentum", "m s⁻²"),
 }
 """Label of a colour bar, and unit."""
 

@@ -44,8 +44,10 @@ __all__ = [
     "read_field",
     "read_quantity",
     "read_state",
+    "read_tensors",
     "write_field",
     "write_state",
+    "write_tensors",
 ]  # fmt: skip
 
 CHECKPOINT = "checkpoint.safetensors"
@@ -129,7 +131,7 @@ def write_field(directory: Path, result: Reconstruction) -> None:
     domain = _domain(result.field)
     if domain is not None and domain != result.box:
         about["domain"] = [domain.lower, domain.upper]
-    _save(directory / FIELD, tensors, {**about, "box": [result.box.lower, result.box.upper], **entries})
+    write_tensors(directory / FIELD, tensors, {**about, "box": [result.box.lower, result.box.upper], **entries})
 
 
 def _domain(field: Field) -> Box | None:
@@ -151,7 +153,7 @@ def _meshes(bodies: Sequence[Body]) -> dict[str, Tensor]:
 
 def read_bodies(directory: Path) -> tuple[Body, ...]:
     """Read the bodies in the flow of a result directory."""
-    return _bodies_of(*_load(directory / FIELD))
+    return _bodies_of(*read_tensors(directory / FIELD))
 
 
 def _bodies_of(tensors: dict[str, Tensor], about: dict[str, Any]) -> tuple[Body, ...]:
@@ -194,7 +196,7 @@ def read_field(directory: Path) -> tuple[Field, Box, float]:
         check_kind(directory, RESULT)
         what = "the directory has no" if directory.is_dir() else "no such directory with a"
         raise InputError(f"expected a reconstruction, but {what} {FIELD}; run nerif reconstruct first", field=directory)
-    tensors, about = _load(path)
+    tensors, about = read_tensors(path)
     if about.get("version", 1) not in (VERSION, WITH_BODIES):
         raise InputError(
             f"expected version {VERSION} or {WITH_BODIES} of fields, got {about['version']}; read it with a later "
@@ -239,12 +241,12 @@ def _field_of(tensors: dict[str, Tensor], about: dict[str, Any], box: Box, bodie
 
 def read_quantity(directory: Path) -> str:
     """Read the quantity of the field of a result directory (volume.QUANTITIES)."""
-    return str(_load(directory / FIELD)[1].get("quantity", INDEX))
+    return str(read_tensors(directory / FIELD)[1].get("quantity", INDEX))
 
 
 def write_state(directory: Path, state: State) -> None:
     """Write a checkpoint atomically: a run killed while writing leaves the previous one."""
-    _save(directory / CHECKPOINT, {k: v.cpu().contiguous() for k, v in state.tensors.items()}, state.scalars)
+    write_tensors(directory / CHECKPOINT, {k: v.cpu().contiguous() for k, v in state.tensors.items()}, state.scalars)
 
 
 def checkpoints(directory: Path, seconds: float) -> OnStep:
@@ -266,10 +268,11 @@ def read_state(directory: Path) -> State:
     path = directory / CHECKPOINT
     if not path.is_file():
         raise InputError(f"expected {CHECKPOINT} to resume from, got none; start without --resume", field=directory)
-    return State(*_load(path))
+    return State(*read_tensors(path))
 
 
-def _save(path: Path, tensors: dict[str, torch.Tensor], about: dict[str, Any]) -> None:
+def write_tensors(path: Path, tensors: dict[str, torch.Tensor], about: dict[str, Any]) -> None:
+    """Write tensors, and other values as JSON, atomically."""
     from safetensors import SafetensorError
     from safetensors.torch import save_file
 
@@ -280,7 +283,8 @@ def _save(path: Path, tensors: dict[str, torch.Tensor], about: dict[str, Any]) -
             raise OSError(errno.EIO, f"cannot be written ({error})", str(path)) from None
 
 
-def _load(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
+def read_tensors(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
+    """Read tensors, and the other values, of a file of `write_tensors`."""
     from safetensors import SafetensorError, safe_open
 
     try:

@@ -15,6 +15,7 @@ from nerif.common.conventions import InputError
 from nerif.common.files import atomic, ending
 from nerif.common.installation import install
 from nerif.common.settings import check_settings
+from nerif.data.velocity_sequence import VelocitySequence
 from nerif.data.volume import Volume, field_of
 from nerif.data.volume_sequence import VolumeSequence
 from nerif.plotting.drawing import COLOUR_MAPS, LABELS, SEQUENTIAL, colour_range, plotted_values
@@ -23,17 +24,19 @@ from nerif.report.isosurface import default_level
 __all__ = ["Movie", "finished_frames", "ranges_over_time"]
 
 FORMATS = (".mp4", ".gif")
-MASKED, GREY = "masked", "#BEBEBE"
+MASKED, GREY, VECTORS = "masked", "#BEBEBE", "velocity"
+ARROWS, STREAMLINES = 20, 250  # along the longest edge; in all
+SLOW = 0.03  # of the largest speed, below which an arrow is a dot
 
 
 @dataclass(frozen=True)
 class Movie:
     """Settings of a movie."""
 
-    style: Literal["isosurface", "slices"] = "isosurface"
-    """Isosurface, or three slices through the centre of the box."""
+    style: Literal["isosurface", "slices", "arrows", "streamlines"] = "isosurface"
+    """Isosurface, or three slices through the centre of the box; of a velocity also arrows or streamlines."""
     quantity: str = ""
-    """Quantity to draw (default: density or, of another field than the index, the field)."""
+    """Quantity to draw (default: density, the field if it is another than the index, or the speed)."""
     level: float | None = None
     """Value of the isosurface, in the plotted unit (default: halfway between the ambient and the extreme)."""
     size: tuple[int, int] = (960, 720)
@@ -54,7 +57,8 @@ class Movie:
 
     def quantity_of(self, store: VolumeSequence) -> str:
         """Return the quantity that is drawn of a store."""
-        default = "density" if "density" in store.quantities else field_of(store.quantities)
+        names = store.quantities
+        default = next((name for name in ("density", "speed") if name in names), field_of(names))
         quantity = self.quantity or default
         if quantity is None or quantity not in store.quantities:
             raise InputError(
@@ -68,9 +72,12 @@ class Movie:
         limits, level = ranges_over_time(store, quantity, frames)
         level = level if self.level is None else self.level
         for i, time in zip(frames, instants([store.times[i] for i in frames]), strict=True):
-            yield self._image(store.volume(i, quantity), f"t = {time}", limits, level)
+            vectors = store.vectors(i).numpy() if isinstance(store, VelocitySequence) else None
+            yield self._image(store.volume(i, quantity), f"t = {time}", limits, level, vectors)
 
-    def _image(self, volume: Volume, text: str, limits: tuple[float, float], level: float) -> np.ndarray:
+    def _image(
+        self, volume: Volume, text: str, limits: tuple[float, float], level: float, vectors: np.ndarray | None
+    ) -> np.ndarray:
         import pyvista as pv
         from vtkmodules.vtkCommonCore import vtkLogger
 
@@ -81,9 +88,16 @@ class Movie:
         plotter = pv.Plotter(off_screen=True, window_size=list(self.size))
         try:
             plotter.set_background("white")
-            if self.style == "slices":
-                bar = {"title": name, "color": "black", "vertical": True, "fmt": "%.2g", "n_labels": 4}
-                bar |= {"position_x": 0.86, "position_y": 0.15, "width": 0.06, "height": 0.5}
+            bar = {"title": name, "color": "black", "vertical": True, "fmt": "%.2g", "n_labels": 4}
+            bar |= {"position_x": 0.86, "position_y": 0.15, "width": 0.06, "height": 0.5}
+            if vectors is not None and self.style in ("arrows", "streamlines"):
+                lines = _arrows(grid, vectors) if self.style == "arrows" else _streamlines(grid, vectors)
+                if lines.n_points:
+                    plotter.add_mesh(
+                        lines, scalars=name, clim=limits, cmap=COLOUR_MAPS.get(volume.quantity, SEQUENTIAL),
+                        scalar_bar_args=bar, lighting=False,
+                    )  # fmt: skip
+            elif self.style == "slices":
                 x, y, z = volume.grid.box.centre
                 plotter.add_mesh(
                     grid.slice_orthogonal(x=x, y=y, z=z), scalars=name, clim=limits,
@@ -138,6 +152,8 @@ class Movie:
         if not len(frames):
             raise InputError("expected at least one finished frame, got none", field=store.path)
         self.quantity_of(store)
+        if self.style in ("arrows", "streamlines") and not isinstance(store, VelocitySequence):
+            raise InputError(f"expected isosurface or slices for volumes, got {self.style}", field="style")
         with atomic(path) as part, _writer(part, self.frames_per_second) as writer:
             for done, image in enumerate(self.images(store, frames), start=1):
                 writer.append_data(image)
@@ -188,6 +204,44 @@ def _surfaces(grid: Any, name: str, level: float) -> tuple[Any, Any]:
     if surface.n_points:
         surface = surface.clip_scalar(scalars=MASKED, value=0.5)
     return surface, whole.contour([0.5], scalars=MASKED)
+
+
+def _with_vectors(grid: Any, vectors: np.ndarray) -> Any:
+    """Voxel centres with the velocity under VECTORS, 0 where it is unknown."""
+    whole = grid.copy()
+    whole[VECTORS] = np.nan_to_num(vectors).reshape(3, -1).T
+    return whole
+
+
+def _arrows(grid: Any, vectors: np.ndarray) -> Any:
+    """Arrows of the velocity at about ARROWS places along the longest edge; the longest reaches to the next but one."""
+    import pyvista as pv
+
+    step = max(1, max(grid.dimensions) // ARROWS)
+    nx, ny, nz = grid.dimensions
+    places = np.zeros((nz, ny, nx), dtype=bool)
+    places[step // 2 :: step, step // 2 :: step, step // 2 :: step] = True
+    speed = np.linalg.norm(np.nan_to_num(vectors), axis=0)
+    places &= np.isfinite(vectors).all(axis=0) & (speed > SLOW * (speed.max() or 1.0))
+    points = _with_vectors(grid, vectors).extract_points(places.ravel(), include_cells=False)
+    if not points.n_points:
+        return points
+    factor = 2 * step * max(grid.spacing) / speed.max()
+    return points.glyph(orient=VECTORS, scale=VECTORS, factor=factor, geom=pv.Arrow(shaft_radius=0.03, tip_radius=0.09))
+
+
+def _streamlines(grid: Any, vectors: np.ndarray) -> Any:
+    """Tubes along the velocity through places evenly spread over where it is known."""
+    import pyvista as pv
+
+    places = np.flatnonzero(np.isfinite(vectors).all(axis=0).ravel())
+    if not len(places):
+        return pv.PolyData()
+    seeds = pv.PolyData(grid.points[places[:: max(1, len(places) // STREAMLINES)]])
+    lines = _with_vectors(grid, vectors).streamlines_from_source(
+        seeds, vectors=VECTORS, integration_direction="both", max_steps=400, terminal_speed=1e-6,
+    )  # fmt: skip
+    return lines.tube(radius=0.12 * max(grid.spacing)) if lines.n_points else lines
 
 
 def _writer(path: Path, frames_per_second: float) -> Any:

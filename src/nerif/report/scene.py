@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from nerif.common.conventions import unit_shown
-from nerif.data.volume import INDEX, Volume, field_of, name_of, quantities_of
+from nerif.data.volume import INDEX, Volume, name_of, quantities_of
 from nerif.data.volume_sequence import VolumeSequence
 from nerif.geometry import Grid
 from nerif.physics.quantities import GasSettings, derive
@@ -72,10 +72,8 @@ def scene_of(result: Result) -> tuple[dict[str, Any] | None, dict[str, str]]:
     return scene, {name: p["text"] for name, p in packed.items()}
 
 
-def scene_over_time(store: VolumeSequence, frames: list[int]) -> tuple[dict[str, Any], dict[str, str]]:
-    """Return the scene of some frames of a sequence, and the packed volumes by name."""
-    field = field_of(store.quantities)
-    assert field is not None, "a sequence with a field"
+def scene_over_time(store: VolumeSequence, frames: list[int], field: str) -> tuple[dict[str, Any], dict[str, str]]:
+    """Return the scene of a quantity in some frames of a sequence, and the packed volumes by name."""
     small = [packing.coarsen(store.volume(i, field), MAX_FRAME_VOXELS) for i in frames]
     packed = [packing.pack(v.values.double().numpy(), packing.COARSE) for v in small]
     gas = GasSettings(**store.attributes["gas"]) if "gas" in store.attributes else None

@@ -39,7 +39,7 @@ def render_sequence(store: VolumeSequence) -> str:
         )
     places = np.linspace(0, len(frames) - 1, min(len(frames), MAX_FRAMES)).round().astype(int)
     sample = [frames[i] for i in np.unique(places)]
-    scene, arrays = scene_over_time(store, sample)
+    scene, arrays = scene_over_time(store, sample, field)
     about = store.attributes
     measurement = about.get("measurement")
     kinds = [technique(name) for name in about.get("techniques", ())] or [technique_of(field)]

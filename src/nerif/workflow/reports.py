@@ -5,10 +5,11 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from nerif.data.volume_sequence import VolumeSequence
+from nerif.data.velocity_sequence import VelocitySequence, open_volumes
 from nerif.reconstruction.progress import QUIET, Monitor
 from nerif.report import html
 from nerif.report.sequence_page import render_sequence
+from nerif.report.velocity_page import render_velocity
 from nerif.results.directory import REPORT, ResultDirectory
 
 __all__ = ["write_report", "write_sequence_report"]
@@ -33,9 +34,10 @@ def write_report(directory: str | os.PathLike[str], path: Path | None = None, mo
 
 
 def write_sequence_report(store: str | os.PathLike[str], path: Path | None = None, monitor: Monitor = QUIET) -> Path:
-    """Write the report of a store of nerif sequence, complete or not, and return its path."""
+    """Write the report of a store of nerif sequence, complete or not, or of a velocity, and return its path."""
     path = path or Path(store).with_suffix(".html")
-    html.write(render_sequence(VolumeSequence(store)), path)
+    volumes = open_volumes(store)
+    html.write(render_velocity(volumes) if isinstance(volumes, VelocitySequence) else render_sequence(volumes), path)
     _say_size(path, monitor)
     return path
 

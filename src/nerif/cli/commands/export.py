@@ -12,7 +12,8 @@ from nerif.cli.arguments import check_output
 from nerif.cli.commands.output import counting_bar, say
 from nerif.cli.commands.settings import Settings, command
 from nerif.common.conventions import InputError
-from nerif.data.exports import FORMATS, PROGRAMS, export, export_geometry
+from nerif.common.files import ending
+from nerif.data.exports import FORMATS, PROGRAMS, export, export_frame, export_geometry
 from nerif.data.measurement import Measurement
 from nerif.data.volume import quantities_of
 from nerif.geometry import Box, Grid
@@ -30,7 +31,7 @@ class Export(Settings):
     """
 
     result: Annotated[Path, tyro.conf.Positional]
-    """Result directory of nerif reconstruct; for astra and tigre a measurement (.nc)."""
+    """Result directory of nerif reconstruct, or volumes over time (.zarr); for astra and tigre a measurement (.nc)."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Output file; format by its ending: .vti, .nc, .npz, .mat or .csv; for astra and tigre .npz."""
     format: Literal["field", *PROGRAMS] = "field"  # type: ignore[valid-type]
@@ -38,6 +39,8 @@ class Export(Settings):
     quantities: tuple[str, ...] = ()
     """Quantities to write; of an index index_excess (1), n (1), density (kg/m3), temperature (K) (default: all but
     temperature)."""
+    frame: int | None = None
+    """Frame of volumes over time, counted from 0, on their own voxels."""
     voxels: int = 100
     """Voxels along the longest edge."""
     shape: tuple[int, int, int] | None = None
@@ -63,6 +66,12 @@ def run(settings: Export) -> None:
         export_geometry(settings.out, measurement, grid, settings.format, lambda line: say(f"note: {line}"))
         say(f"{settings.out}: {len(measurement.cameras)} views and {' x '.join(map(str, grid.shape))} voxels (z, y, x)")
         return
+    if ending(settings.result) == ".zarr":
+        count = export_frame(settings.out, settings.result, settings.frame, settings.quantities, settings.force)
+        say(f"{settings.out}: {count} quantities of frame {settings.frame}")
+        return
+    if settings.frame is not None:
+        raise InputError("expected volumes over time (.zarr) with --frame", field="frame")
     result = ResultDirectory(settings.result)
     (_, whole, _), quantity = result.field(), result.quantity()
     grid = _grid(settings, whole)

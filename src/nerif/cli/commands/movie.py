@@ -12,7 +12,7 @@ from nerif.cli.arguments import check_output
 from nerif.cli.commands.output import counting_bar, say
 from nerif.cli.commands.settings import Flat, Settings, command
 from nerif.common.settings import Count
-from nerif.data.volume_sequence import VolumeSequence
+from nerif.data.velocity_sequence import open_volumes
 from nerif.report.movie import Movie, finished_frames
 
 __all__ = ["MovieCommand", "main", "run"]
@@ -23,7 +23,7 @@ class MovieCommand(Settings):
     """Draw an isosurface or slices of a sequence over time as .mp4 or .gif, without a window."""
 
     result: Annotated[Path, tyro.conf.Positional]
-    """Result of nerif sequence (.zarr), complete or not, or true field of nerif simulate --times."""
+    """Result of nerif sequence (.zarr), complete or not, true field of nerif simulate --times, or velocity."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Movie to write: NAME.mp4 (H.264) or NAME.gif."""
     every: Count = 1
@@ -36,7 +36,7 @@ class MovieCommand(Settings):
 def run(settings: MovieCommand) -> None:
     """Write the movie."""
     check_output(settings.out, settings.force)
-    store = VolumeSequence(settings.result)
+    store = open_volumes(settings.result)
     complete = finished_frames(store)
     frames = complete[:: settings.every]
     with counting_bar("drawing frames", len(frames)) as bar:

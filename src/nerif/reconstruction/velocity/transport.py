@@ -1,0 +1,122 @@
+"""How well velocities explain that a scalar is carried along: the residual of its transport.
+
+    r = theta_(k+1)(x + u dt / 2) - theta_k(x - u dt / 2) - dt kappa lap theta
+
+on the voxels of the film, then averaged over those of the velocity: an equation holds for averages where waves shorter
+than a few voxels are not resolved.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import cached_property
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerif.fields.grid import VoxelField
+from nerif.geometry import Grid
+from nerif.reconstruction.velocity.interpolation import fixed_spline
+from nerif.reconstruction.velocity.periodic_box import PeriodicBox
+from nerif.reconstruction.velocity.resampling import along_axes, averages, interpolations, laplacian, smooth
+
+__all__ = ["Transport"]
+
+LEAST = 0.01  # of the largest theta: below, nothing visible is carried
+STRONG = 0.05  # of the largest theta
+REACH = 5  # voxels around the scalar at which the residual is evaluated
+MODEL_ERROR = 0.03  # of the local change of theta per interval, that velocities on a grid leave
+ROUNDING = 3.5e-4  # of the largest theta
+
+
+class Transport:
+    """The residual of transport between the instants of a film.
+
+    Parameters
+    ----------
+    theta : scalar at the instants
+    grid : its voxels
+    times : s
+    diffusivity : mm^2/s
+    box : grid of the velocity
+    noise : standard deviation of theta, averaged over voxels of the velocity
+    """
+
+    def __init__(
+        self, theta: Float[Tensor, "t z y x"], grid: Grid, times: Sequence[float], diffusivity: float,
+        box: PeriodicBox, noise: float = 0.0,
+    ) -> None:  # fmt: skip
+        self.grid, self.box, self.times = grid, box, times
+        self.intervals = torch.tensor(times).double().diff().float()
+        self._down = averages(grid, box.grid)
+        self._up = interpolations(box.grid, grid, box.shape, box.first)
+        self.fields = [VoxelField.through(volume, grid) for volume in theta]
+        curvature = laplacian(theta, grid.spacing[::-1])
+        gain = diffusivity * self.intervals[:, None, None, None] * 0.5 * (curvature[1:] + curvature[:-1])
+        centres, largest = grid.points().reshape(-1, 3), float(theta.abs().max())
+        self.places, self.points, self.gains = [], [], []
+        pool = torch.nn.functional.max_pool3d
+        for k in range(len(self.intervals)):
+            strength = torch.maximum(theta[k].abs(), theta[k + 1].abs())[None]
+            near = pool(strength, 2 * REACH + 1, stride=1, padding=REACH)[0] > LEAST * largest
+            place = near.reshape(-1).nonzero()[:, 0]
+            self.places.append(place)
+            self.points.append(centres[place])
+            self.gains.append(gain[k].reshape(-1)[place])
+        self.core = self.coarse(torch.maximum(theta[1:].abs(), theta[:-1].abs())) > STRONG * largest
+        """Voxels of the velocity in which much of the scalar is, of each interval: those of the misfit."""
+        change = self.coarse(theta[1:] - theta[:-1])
+        self._local = smooth(change.square(), (2.0, 2.0, 2.0)).clamp_min(0)
+        self._floor = max(noise, ROUNDING * largest)
+        self.deviation = self._deviation(0.0)
+        """Standard deviation of the residual."""
+
+    def coarse(self, values: Float[Tensor, "*t z y x"]) -> Float[Tensor, "*t z2 y2 x2"]:
+        """Return averages over the voxels of the velocity."""
+        return along_axes(values, self._down)
+
+    def _deviation(self, noise: float) -> Tensor:
+        return (self._floor**2 + (MODEL_ERROR**2 + noise**2) * self._local).sqrt()
+
+    def weigh(self, residual: Float[Tensor, "t z y x"]) -> float:
+        """Estimate the noise of the densities from a residual, set `deviation`, and return it relative to the change.
+
+        An error of one frame enters the residuals before and after it with opposite signs, so that their covariance is
+        minus its variance; what the velocity does not explain yet has the same sign in both.
+        """
+        covariance = float((residual[1:] * residual[:-1]).sum()) / max(len(residual) - 1, 1)
+        size = float(self._local.sum()) / len(self._local)
+        noise = math.sqrt(max(0.0, -2 * covariance) / size)
+        self.deviation = self._deviation(noise)
+        return noise
+
+    @cached_property
+    def region(self) -> Float[Tensor, "t z y x"]:
+        """Voxels of the velocity in which the scalar is carried, of each interval."""
+        masks = torch.zeros(len(self.intervals), self.grid.shape[0] * self.grid.shape[1] * self.grid.shape[2])
+        for mask, place in zip(masks, self.places, strict=True):
+            mask[place] = 1
+        return self.coarse(masks.reshape(-1, *self.grid.shape)) > 0.5
+
+    def residual(self, splines: Float[Tensor, "t 3 zp yp xp"]) -> Float[Tensor, "t z y x"]:
+        """Return the residual of every interval.
+
+        Parameters
+        ----------
+        splines : coefficients of the velocity at the instants, mm/s
+        """
+        velocity = along_axes(0.5 * (splines[1:] + splines[:-1]), self._up)
+        lower, upper = (torch.tensor(corner) for corner in (self.grid.box.lower, self.grid.box.upper))
+        residuals = []
+        for k, (u, place, points, gain) in enumerate(
+            zip(velocity.unbind(), self.places, self.points, self.gains, strict=True)
+        ):
+            step = 0.5 * self.intervals[k] * u.reshape(3, -1)[:, place].T
+            after, before = points + step, points - step
+            inside = ((after > lower) & (after < upper) & (before > lower) & (before < upper)).all(dim=1)
+            change = fixed_spline(self.fields[k + 1], after) - fixed_spline(self.fields[k], before)
+            residual = torch.zeros(self.grid.shape).reshape(-1)
+            residuals.append(residual.index_put((place,), (change - gain) * inside).reshape(self.grid.shape))
+        return self.coarse(torch.stack(residuals))

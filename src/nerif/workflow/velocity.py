@@ -1,0 +1,169 @@
+"""From the densities of a film to velocity and pressure: nerif velocity as a Python call."""
+
+from __future__ import annotations
+
+import math
+import os
+import time
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerif.common.conventions import InputError
+from nerif.common.files import ending
+from nerif.common.interruption import if_interrupted
+from nerif.data.velocity_sequence import COMPONENTS, VelocitySequence
+from nerif.data.volume import INDEX
+from nerif.data.volume_sequence import VolumeSequence
+from nerif.fields.grid import VoxelField
+from nerif.physics.gas_optics import density_from_index, gladstone_dale
+from nerif.physics.quantities import GasSettings
+from nerif.reconstruction.files import digest, read_tensors, write_tensors
+from nerif.reconstruction.velocity.assimilation import Flow, Iterate, State, VelocityFit
+
+__all__ = ["densities", "velocity_of_film"]
+
+CHECKPOINT_INTERVAL = 20.0  # s
+
+
+def velocity_of_film(
+    film: str | os.PathLike[str],
+    out: str | os.PathLike[str],
+    settings: VelocityFit | None = None,
+    *,
+    force: bool = False,
+    on_iterate: Callable[[Iterate], None] = lambda iterate: None,
+    say: Callable[[str], None] = lambda line: None,
+) -> VelocitySequence:
+    """Compute velocity and pressure from the densities of a film, and write them to a store.
+
+    An interrupted run continues from its checkpoint beside the store if film and settings are the same.
+
+    Parameters
+    ----------
+    film : result of nerif sequence (.zarr), or true fields over time
+    out : store (.zarr) to write
+    settings : of the method
+    force : overwrite `out`
+    on_iterate : called after every iteration
+    say : called with lines of text
+    """
+    film, out, settings = Path(film), Path(out), settings or VelocityFit()
+    if ending(out) != ".zarr":
+        raise InputError(f"expected a name ending in .zarr, got '{out.name}'", field="out")
+    if out.exists() and not force:
+        raise InputError("exists already and was left as it is; give another --out, or --force", field=out)
+    store = VolumeSequence(film)
+    theta = densities(store)
+    checkpoint = out.with_suffix(".checkpoint.safetensors")
+    inputs = digest([theta, list(store.times), _without_limits(settings)])
+    state = _resumed(checkpoint, inputs, say)
+    saved = time.monotonic()
+
+    def update(iterate: Iterate, best: State) -> None:
+        nonlocal saved
+        if time.monotonic() - saved > CHECKPOINT_INTERVAL:
+            about = {"inputs": inputs, "level": best.level, "iterations": best.iterations, "seconds": best.seconds}
+            write_tensors(checkpoint, {"controls": best.controls}, about)
+            saved = time.monotonic()
+        on_iterate(iterate)
+
+    def stopped() -> str:
+        if not checkpoint.exists():
+            return "nothing was written; run the same command again"
+        return f"the state is kept in {checkpoint}; run the same command again to continue"
+
+    with if_interrupted(stopped):
+        flow = settings(theta, store.grid, store.times, update, state)
+    result = _write(out, store, settings, flow)
+    checkpoint.unlink(missing_ok=True)
+    determined = float(flow.determined.float().mean())
+    say(
+        f"{out}: {len(store)} instants, velocity known in {determined:.0%} of the box, rms residual of transport "
+        f"{flow.misfit:.2f} of its standard deviation, {flow.state.iterations} iterations, {flow.state.seconds:.0f} s"
+    )
+    return result
+
+
+def densities(store: VolumeSequence) -> Float[Tensor, "t z y x"]:
+    """Return theta = -(rho - rho_0) / rho_0 of all frames, by the law of Gladstone and Dale."""
+    if "status" in store.group:
+        status = store.read("status", slice(None))
+        if (bad := np.flatnonzero(status != 1)).size:
+            raise InputError(
+                f"frame {bad[0]} is missing or failed; run nerif sequence again (--retry for failed frames)",
+                field=store.path,
+            )
+    if INDEX not in store.quantities:
+        raise InputError(
+            f"expected {INDEX} among its quantities, got {', '.join(store.quantities)}; run nerif sequence with "
+            f"--quantities {INDEX}",
+            field=store.path,
+        )
+    if not store.n_ambient > 1:
+        raise InputError(f"expected an ambient index above 1, got {store.n_ambient}", field=store.path)
+    return torch.from_numpy(store.read(INDEX, slice(None))).float() / (1 - store.n_ambient)
+
+
+def _without_limits(settings: VelocityFit) -> dict[str, Any]:
+    return {name: value for name, value in asdict(settings).items() if name not in ("time_limit", "max_iterations")}
+
+
+def _resumed(checkpoint: Path, inputs: str, say: Callable[[str], None]) -> State | None:
+    """Return the state in a checkpoint of the same inputs."""
+    if not checkpoint.exists():
+        return None
+    tensors, about = read_tensors(checkpoint)
+    if about.get("inputs") != inputs:
+        say(f"{checkpoint}: of another film or other settings; started again")
+        return None
+    say(f"continuing after {about['iterations']} iterations")
+    return State(about["level"], tensors["controls"], about["iterations"], about["seconds"])
+
+
+def _write(out: Path, film: VolumeSequence, settings: VelocityFit, flow: Flow) -> VelocitySequence:
+    """Write a flow on the grid of the film, in SI units."""
+    gas = GasSettings(**film.attributes["gas"]) if "gas" in film.attributes else GasSettings()
+    constant = gladstone_dale(gas.composition, gas.wavelength_nm)
+    density = float(density_from_index(0.0, film.n_ambient, constant))
+    more = ["transport_residual"]
+    if flow.pressure is not None:
+        more += ["pressure", "momentum_residual"]
+    about = {
+        "film": str(film.path.resolve()), "n_ambient": film.n_ambient, "physics": settings.physics,
+        "viscosity": settings.viscosity * 1e-6, "diffusivity": settings.diffusivity * 1e-6,
+        "gravity": [g * 1e-3 for g in settings.gravity], "reference_density": density,
+        "units": "viscosity and diffusivity in m2 s-1, gravity in m s-2, reference_density in kg m-3",
+        "settings": asdict(settings), "misfit": flow.misfit, "iterations": flow.state.iterations,
+        "seconds": flow.state.seconds,
+    }  # fmt: skip
+    store = VelocitySequence.begin(out, film.times, film.grid, more, about)
+    resize = torch.nn.functional.interpolate
+    determined = resize(flow.determined.float()[:, None], film.grid.shape, mode="nearest-exact")
+    residual = _at_instants(flow.transport)
+    momentum = None if flow.momentum is None else _at_instants(flow.momentum.norm(dim=1))
+    for k in range(len(film)):
+        unknown = determined[k, 0] < 0.5
+
+        def fine(values: Tensor, scale: float, unknown: Tensor = unknown) -> Tensor:
+            spline = VoxelField.through(scale * values, flow.grid)
+            return spline.sample(film.grid).masked_fill(unknown, math.nan)
+
+        arrays = dict(zip(COMPONENTS, (fine(component, 1e-3) for component in flow.velocity[k]), strict=True))
+        arrays["transport_residual"] = fine(residual[k], 1.0)
+        if flow.pressure is not None and momentum is not None:
+            arrays["pressure"] = fine(flow.pressure[k], density * 1e-6)
+            arrays["momentum_residual"] = fine(momentum[k], 1e-3)
+        store.write_frame(k, arrays)
+    return store
+
+
+def _at_instants(values: Float[Tensor, "k z y x"]) -> Float[Tensor, "t z y x"]:
+    """Return means of the intervals before and after each instant."""
+    return torch.cat([values[:1], 0.5 * (values[1:] + values[:-1]), values[-1:]])

@@ -1,0 +1,162 @@
+"""nerif velocity: from a film of densities to a store of velocities, its report, movie and export."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from commands import run
+from nerif.common.interruption import Interrupted
+from nerif.data.kinds import VELOCITY, kind_of
+from nerif.data.velocity_sequence import VelocitySequence
+from nerif.data.volume import Volume
+from nerif.data.volume_sequence import VolumeSequence
+from nerif.data.vti import read_vti
+from nerif.geometry import Box, Grid
+from nerif.reconstruction.velocity.assimilation import Iterate, VelocityFit
+from nerif.workflow.velocity import velocity_of_film
+from refusals import refused
+
+pytest.importorskip("zarr", reason="velocities are stored by zarr (the extra `sequence`)")
+
+GRID = Grid(Box((-20.0, -20.0, -30.0), (20.0, 20.0, 30.0)), (24, 16, 16))
+TIMES = tuple(0.004 * k for k in range(5))
+RISE = 400.0  # mm/s
+N_AMBIENT = 1.00027
+PLUME = Path(__file__).parents[2].parent / "shared" / "data" / "plume" / "plume.nc"
+QUICK = ("--resolution", "12", "--max-iterations", "12", "--time-limit", "0")
+
+
+def film_of(path: Path, thetas: list[torch.Tensor], grid: Grid, times: tuple[float, ...]) -> Path:
+    """Write volumes over time of theta = -(rho - rho_0) / rho_0."""
+    store = VolumeSequence.create(path, times, grid, ("index_excess",), N_AMBIENT)
+    for index, theta in enumerate(thetas):
+        store.write(index, [Volume.of((1 - N_AMBIENT) * theta, grid, "index_excess", N_AMBIENT)])
+    return path
+
+
+@pytest.fixture(scope="module")
+def film(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A light ring that rises."""
+    x, y, z = GRID.points(torch.float32).unbind(-1)
+    radius = (x**2 + y**2).sqrt()
+    thetas = [
+        0.1 * torch.exp(-(((radius - 7.0) / 4.0) ** 2) - ((z + 4.0 - RISE * t) / 5.0) ** 2) for t in TIMES
+    ]  # fmt: skip
+    return film_of(tmp_path_factory.mktemp("film") / "film.zarr", thetas, GRID, TIMES)
+
+
+@pytest.fixture(scope="module")
+def velocity(film: Path) -> Path:
+    """The velocity of that ring."""
+    out = film.with_name("velocity.zarr")
+    assert run("velocity", film, "-o", out, *QUICK) == 0
+    return out
+
+
+def test_the_ring_is_found_to_rise_and_the_ambient_is_unknown(velocity: Path):
+    import xarray as xr
+
+    with xr.open_zarr(velocity, consolidated=False) as data:
+        assert data["w"].attrs["units"] == "m s-1"
+        assert data["w"].attrs["standard_name"] == "upward_air_velocity"
+        assert data["pressure"].attrs["units"] == "Pa"
+        assert data.attrs["viscosity"] == pytest.approx(15e-6)
+        assert data.attrs["reference_density"] == pytest.approx(1.19, rel=0.1)
+        core = data["w"].sel(time=TIMES[2]).sel(z=slice(-8, 0)).values
+        assert np.nanmean(core) > 0.1
+        assert np.isnan(data["w"].isel(time=2, z=0, y=0, x=0))
+        assert np.isfinite(data["transport_residual"].values).any()
+    assert kind_of(velocity) is VELOCITY
+
+
+def test_report_movie_and_paraview_show_vectors(velocity: Path, tmp_path: Path):
+    page = velocity.with_suffix(".html").read_text()
+    assert "Streamlines and vorticity" in page
+    assert "Velocity is given in" in page
+    out = tmp_path / "frame.vti"
+    assert run("export", velocity, "--frame", "2", "-o", out) == 0
+    arrays, grid, _ = read_vti(out)
+    assert grid.shape == GRID.shape
+    pv = pytest.importorskip("pyvista", reason="the extra `movie` is not installed")
+    image = pv.read(out)
+    store = VelocitySequence(velocity)
+    expected = store.vectors(2).reshape(3, -1).T.numpy()
+    np.testing.assert_allclose(image.point_data["velocity"], expected)
+    assert {"speed", "vorticity", "pressure"} <= set(arrays)
+    for style in ("arrows", "streamlines", "slices"):
+        movie = tmp_path / f"{style}.gif"
+        assert run("movie", velocity, "-o", movie, "--style", style, "--every", "4", "--size", "160", "120") == 0
+        assert movie.stat().st_size > 1000
+
+
+def test_vorticity_of_a_rigid_rotation_is_twice_its_rate(tmp_path: Path):
+    store = VelocitySequence.begin(tmp_path / "rotation.zarr", (0.0,), GRID, (), {})
+    x, y, _ = GRID.points(torch.float32).unbind(-1)
+    rate = 3.0  # 1/s
+    store.write_frame(0, {"u": -rate * y / 1e3, "v": rate * x / 1e3, "w": torch.zeros_like(x)})
+    torch.testing.assert_close(store.volume(0, "vorticity").values, torch.full(GRID.shape, 2 * rate))
+
+
+def test_an_interrupted_run_continues_from_its_checkpoint(film: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("nerif.workflow.velocity.CHECKPOINT_INTERVAL", 0.0)
+    settings, out = VelocityFit(resolution=12, max_iterations=12, time_limit=0), tmp_path / "v.zarr"
+
+    def stop(iterate: Iterate) -> None:
+        if iterate.iterations == 6:
+            raise KeyboardInterrupt
+
+    with pytest.raises(Interrupted, match="run the same command again"):
+        velocity_of_film(film, out, settings, on_iterate=stop)
+    checkpoint = out.with_suffix(".checkpoint.safetensors")
+    assert checkpoint.is_file()
+    assert not out.exists()
+    lines: list[str] = []
+    counts: list[int] = []
+    velocity_of_film(film, out, settings, say=lines.append, on_iterate=lambda i: counts.append(i.iterations))
+    assert lines[0] == "continuing after 6 iterations"
+    assert counts[0] == 7
+    assert out.exists()
+    assert not checkpoint.exists()
+    with refused(out):
+        velocity_of_film(film, out, settings)
+
+
+def test_films_that_show_no_velocity_are_refused(film: Path, tmp_path: Path):
+    still = film_of(tmp_path / "still.zarr", [torch.zeros(GRID.shape)] * 3, GRID, TIMES[:3])
+    with refused("film"):
+        velocity_of_film(still, tmp_path / "v.zarr")
+    short = film_of(tmp_path / "short.zarr", [torch.ones(GRID.shape)] * 2, GRID, TIMES[:2])
+    with refused("film"):
+        velocity_of_film(short, tmp_path / "v.zarr")
+    x, _, _ = GRID.points(torch.float32).unbind(-1)
+    flame = film_of(tmp_path / "flame.zarr", [0.8 * torch.exp(-((x / 5) ** 2))] * 3, GRID, TIMES[:3])
+    with refused("physics"):
+        velocity_of_film(flame, tmp_path / "v.zarr")
+    assert run("velocity", still, "-o", tmp_path / "v.zarr") == 2
+    assert not (tmp_path / "v.zarr").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not PLUME.is_file(), reason="the data of the plume are not beside the project (shared/data)")
+def test_the_velocity_of_a_plume_by_another_solver(tmp_path: Path):
+    import xarray as xr
+
+    with xr.open_dataset(PLUME) as data:
+        thetas = [torch.tensor(frame, dtype=torch.float32) for frame in data["theta"].values[:11]]
+        times = tuple(float(t) for t in data["time"].values[:11])
+        true = np.stack([data[name].values[:6] for name in "uvw"], axis=1) / 1e3
+    grid = Grid(Box.cube(100.0), (60, 60, 60))
+    film = film_of(tmp_path / "plume.zarr", thetas, grid, times)
+    settings = VelocityFit(viscosity=30.0, diffusivity=30.0, resolution=24, time_limit=150)
+    store = velocity_of_film(film, tmp_path / "v.zarr", settings)
+    error = size = 0.0
+    for k in range(6):
+        inside = (thetas[2 * k] > 0.05 * max(float(t.max()) for t in thetas)).numpy()
+        found = store.vectors(2 * k).numpy()
+        error += float(np.square((found - true[k])[:, inside]).sum())
+        size += float(np.square(true[k][:, inside]).sum())
+    assert (error / size) ** 0.5 < 0.3
