@@ -76,7 +76,7 @@ class Movie:
             yield self._image(store.volume(i, quantity), f"t = {time}", limits, level, vectors)
 
     def _image(
-        self, volume: Volume, text: str, limits: tuple[float, float], level: float, vectors: np.ndarray | None
+        self, volume: Volume, text: str, limits: tuple[float, float], level: float, vectors: np.ndarray | None = None
     ) -> np.ndarray:
         import pyvista as pv
         from vtkmodules.vtkCommonCore import vtkLogger
