@@ -125,6 +125,14 @@ def test_an_interrupted_run_continues_from_its_checkpoint(film: Path, tmp_path: 
         velocity_of_film(film, out, settings)
 
 
+def test_a_part_of_a_film_has_its_own_instants(film: Path, tmp_path: Path):
+    settings = VelocityFit(resolution=8, max_iterations=2, time_limit=0)
+    store = velocity_of_film(film, tmp_path / "part.zarr", settings, frames=(1, 4))
+    assert store.times == pytest.approx(TIMES[1:4])
+    with refused("frames"):
+        velocity_of_film(film, tmp_path / "v.zarr", settings, frames=(2, 9))
+
+
 def test_films_that_show_no_velocity_are_refused(film: Path, tmp_path: Path):
     still = film_of(tmp_path / "still.zarr", [torch.zeros(GRID.shape)] * 3, GRID, TIMES[:3])
     with refused("film"):

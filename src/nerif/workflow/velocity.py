@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -37,6 +37,7 @@ def velocity_of_film(
     out: str | os.PathLike[str],
     settings: VelocityFit | None = None,
     *,
+    frames: tuple[int, int] | None = None,
     force: bool = False,
     on_iterate: Callable[[Iterate], None] = lambda iterate: None,
     say: Callable[[str], None] = lambda line: None,
@@ -50,6 +51,7 @@ def velocity_of_film(
     film : result of nerif sequence (.zarr), or true fields over time
     out : store (.zarr) to write
     settings : of the method
+    frames : first one, and the one after the last; None: all
     force : overwrite `out`
     on_iterate : called after every iteration
     say : called with lines of text
@@ -60,9 +62,12 @@ def velocity_of_film(
     if out.exists() and not force:
         raise InputError("exists already and was left as it is; give another --out, or --force", field=out)
     store = VolumeSequence(film)
-    theta = densities(store)
+    first, last = frames or (0, len(store))
+    if not 0 <= first < last <= len(store):
+        raise InputError(f"expected a part of 0 to {len(store)}, got {first} to {last}", field="frames")
+    theta, times = densities(store, slice(first, last)), store.times[first:last]
     checkpoint = out.with_suffix(".checkpoint.safetensors")
-    inputs = digest([theta, list(store.times), _without_limits(settings)])
+    inputs = digest([theta, list(times), _without_limits(settings)])
     state = _resumed(checkpoint, inputs, say)
     saved = time.monotonic()
 
@@ -80,24 +85,25 @@ def velocity_of_film(
         return f"the state is kept in {checkpoint}; run the same command again to continue"
 
     with if_interrupted(stopped):
-        flow = settings(theta, store.grid, store.times, update, state)
-    result = _write(out, store, settings, flow)
+        flow = settings(theta, store.grid, times, update, state)
+    result = _write(out, store, times, settings, flow)
     checkpoint.unlink(missing_ok=True)
     determined = float(flow.determined.float().mean())
     say(
-        f"{out}: {len(store)} instants, velocity known in {determined:.0%} of the box, rms residual of transport "
+        f"{out}: {len(times)} instants, velocity known in {determined:.0%} of the box, rms residual of transport "
         f"{flow.misfit:.2f} of its standard deviation, {flow.state.iterations} iterations, {flow.state.seconds:.0f} s"
     )
     return result
 
 
-def densities(store: VolumeSequence) -> Float[Tensor, "t z y x"]:
-    """Return theta = -(rho - rho_0) / rho_0 of all frames, by the law of Gladstone and Dale."""
+def densities(store: VolumeSequence, frames: slice = slice(None)) -> Float[Tensor, "t z y x"]:
+    """Return theta = -(rho - rho_0) / rho_0 of frames, by the law of Gladstone and Dale."""
     if "status" in store.group:
-        status = store.read("status", slice(None))
+        status = store.read("status", frames)
         if (bad := np.flatnonzero(status != 1)).size:
+            frame = bad[0] + (frames.start or 0)
             raise InputError(
-                f"frame {bad[0]} is missing or failed; run nerif sequence again (--retry for failed frames)",
+                f"frame {frame} is missing or failed; run nerif sequence again (--retry for failed frames)",
                 field=store.path,
             )
     if INDEX not in store.quantities:
@@ -108,7 +114,7 @@ def densities(store: VolumeSequence) -> Float[Tensor, "t z y x"]:
         )
     if not store.n_ambient > 1:
         raise InputError(f"expected an ambient index above 1, got {store.n_ambient}", field=store.path)
-    return torch.from_numpy(store.read(INDEX, slice(None))).float() / (1 - store.n_ambient)
+    return torch.from_numpy(store.read(INDEX, frames)).float() / (1 - store.n_ambient)
 
 
 def _without_limits(settings: VelocityFit) -> dict[str, Any]:
@@ -127,7 +133,9 @@ def _resumed(checkpoint: Path, inputs: str, say: Callable[[str], None]) -> State
     return State(about["level"], tensors["controls"], about["iterations"], about["seconds"])
 
 
-def _write(out: Path, film: VolumeSequence, settings: VelocityFit, flow: Flow) -> VelocitySequence:
+def _write(
+    out: Path, film: VolumeSequence, times: Sequence[float], settings: VelocityFit, flow: Flow
+) -> VelocitySequence:
     """Write a flow on the grid of the film, in SI units."""
     gas = GasSettings(**film.attributes["gas"]) if "gas" in film.attributes else GasSettings()
     constant = gladstone_dale(gas.composition, gas.wavelength_nm)
@@ -143,12 +151,12 @@ def _write(out: Path, film: VolumeSequence, settings: VelocityFit, flow: Flow) -
         "settings": asdict(settings), "misfit": flow.misfit, "iterations": flow.state.iterations,
         "seconds": flow.state.seconds,
     }  # fmt: skip
-    store = VelocitySequence.begin(out, film.times, film.grid, more, about)
+    store = VelocitySequence.begin(out, times, film.grid, more, about)
     resize = torch.nn.functional.interpolate
     determined = resize(flow.determined.float()[:, None], film.grid.shape, mode="nearest-exact")
     residual = _at_instants(flow.transport)
     momentum = None if flow.momentum is None else _at_instants(flow.momentum.norm(dim=1))
-    for k in range(len(film)):
+    for k in range(len(times)):
         unknown = determined[k, 0] < 0.5
 
         def fine(values: Tensor, scale: float, unknown: Tensor = unknown) -> Tensor:

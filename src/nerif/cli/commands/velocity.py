@@ -30,6 +30,8 @@ class Velocity(Settings):
     """Result of nerif sequence (.zarr), complete, or true fields over time."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Velocity (.zarr) to write; its report lies beside it."""
+    frames: tuple[int, int] | None = None
+    """First frame, and the one after the last (default: all)."""
     force: bool = False
     """Overwrite an existing result."""
     fit: Annotated[VelocityFit, Flat] = field(default_factory=VelocityFit)
@@ -48,7 +50,13 @@ def run(settings: Velocity) -> VelocitySequence:
             bar(done, figures, iterate.seconds)
 
         result = velocity_of_film(
-            settings.film, settings.out, settings.fit, force=settings.force, on_iterate=update, say=MONITOR.say
+            settings.film,
+            settings.out,
+            settings.fit,
+            frames=settings.frames,
+            force=settings.force,
+            on_iterate=update,
+            say=MONITOR.say,
         )
     write_sequence_report(settings.out, monitor=MONITOR)
     return result
