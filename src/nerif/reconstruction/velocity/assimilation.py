@@ -41,11 +41,11 @@ PHYSICS = {
     "transport": "the density is carried along by a flow without divergence; no equation of momentum, no pressure",
 }
 LARGEST_DENSITY_CHANGE = 0.3  # of the Boussinesq equations
-LEVELS = (0.67, 1.0, 1.0)  # voxels along an edge, relative to the finest grid; noise is estimated before each
-SHARES = (0.15, 0.35, 0.5)  # of the time
+LEVELS = (0.67, 1.0)  # voxels along an edge, relative to the finest grid; noise is estimated before each
+SHARES = (0.1, 0.9)  # of the time
 MIN_VOXELS = 8
 HISTORY = 60  # steps that L-BFGS remembers
-ENOUGH = 1.0  # mean square of residual / sigma at which a level ends
+ENOUGH = 0.7  # rms of residual / sigma at which a level ends
 GAINS = 2.0  # vorticity, relative to that of a flow which changes the density at the rate in the film
 
 
