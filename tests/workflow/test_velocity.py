@@ -125,10 +125,21 @@ def test_an_interrupted_run_continues_from_its_checkpoint(film: Path, tmp_path: 
         velocity_of_film(film, out, settings)
 
 
+def test_an_interruption_while_writing_leaves_no_store(film: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(VelocitySequence, "write_frame", stop)
+    with pytest.raises(KeyboardInterrupt):
+        velocity_of_film(film, tmp_path / "v.zarr", VelocityFit(resolution=8, max_iterations=2, time_limit=0))
+    assert not (tmp_path / "v.zarr").exists()
+
+
 def test_a_part_of_a_film_has_its_own_instants(film: Path, tmp_path: Path):
     settings = VelocityFit(resolution=8, max_iterations=2, time_limit=0)
     store = velocity_of_film(film, tmp_path / "part.zarr", settings, frames=(1, 4))
     assert store.times == pytest.approx(TIMES[1:4])
+    assert run("movie", film, "-o", tmp_path / "film.gif", "--style", "arrows") == 2
     with refused("frames"):
         velocity_of_film(film, tmp_path / "v.zarr", settings, frames=(2, 9))
 
@@ -144,6 +155,9 @@ def test_films_that_show_no_velocity_are_refused(film: Path, tmp_path: Path):
     flame = film_of(tmp_path / "flame.zarr", [0.8 * torch.exp(-((x / 5) ** 2))] * 3, GRID, TIMES[:3])
     with refused("physics"):
         velocity_of_film(flame, tmp_path / "v.zarr")
+    hidden = film_of(tmp_path / "hidden.zarr", [torch.full(GRID.shape, float("nan"))] * 3, GRID, TIMES[:3])
+    with refused("film"):
+        velocity_of_film(hidden, tmp_path / "v.zarr")
     assert run("velocity", still, "-o", tmp_path / "v.zarr") == 2
     assert not (tmp_path / "v.zarr").exists()
 

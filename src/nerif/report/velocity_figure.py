@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -29,7 +30,7 @@ def draw_streamlines(figure: Figure, store: VelocitySequence, index: int) -> Non
     _draw(figure, store, index, "vorticity", _streamlines)
 
 
-def _draw(figure: Figure, store: VelocitySequence, index: int, quantity: str, add: object) -> None:
+def _draw(figure: Figure, store: VelocitySequence, index: int, quantity: str, add: Callable[..., None]) -> None:
     volume, vectors = store.volume(index, quantity), store.vectors(index).numpy()
     limits = (0.0, colour_range(volume.values.numpy())[1])
     line = figure.subplots(1, len(PLANES_SHOWN))
@@ -38,7 +39,6 @@ def _draw(figure: Figure, store: VelocitySequence, index: int, quantity: str, ad
         axis, (across, up) = "zyx".index(normal), PLANES[normal]
         plane = np.take(vectors, vectors.shape[1 + axis] // 2, axis=1 + axis)
         x, y = (store.grid.axis(a).numpy() for a in (across, up))
-        assert callable(add)
         add(axes, x, y, plane["xyz".index(across)], plane["xyz".index(up)])
         along = store.grid.axis(normal)
         axes.set_title(f"{normal} = {float(along[len(along) // 2]):.1f} mm")

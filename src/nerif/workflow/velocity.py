@@ -16,11 +16,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerif.common.conventions import InputError
-from nerif.common.files import ending
+from nerif.common.files import atomic, ending
 from nerif.common.interruption import if_interrupted
+from nerif.data.measurement_sequence import check_store
 from nerif.data.velocity_sequence import COMPONENTS, VelocitySequence
 from nerif.data.volume import INDEX
-from nerif.data.volume_sequence import VolumeSequence
+from nerif.data.volume_sequence import FIELDS, VolumeSequence
 from nerif.fields.grid import VoxelField
 from nerif.physics.gas_optics import density_from_index, gladstone_dale
 from nerif.physics.quantities import GasSettings
@@ -151,25 +152,26 @@ def _write(
         "settings": asdict(settings), "misfit": flow.misfit, "iterations": flow.state.iterations,
         "seconds": flow.state.seconds,
     }  # fmt: skip
-    store = VelocitySequence.begin(out, times, film.grid, more, about)
     resize = torch.nn.functional.interpolate
     determined = resize(flow.determined.float()[:, None], film.grid.shape, mode="nearest-exact")
     residual = _at_instants(flow.transport)
     momentum = None if flow.momentum is None else _at_instants(flow.momentum.norm(dim=1))
-    for k in range(len(times)):
-        unknown = determined[k, 0] < 0.5
 
-        def fine(values: Tensor, scale: float, unknown: Tensor = unknown) -> Tensor:
-            spline = VoxelField.through(scale * values, flow.grid)
-            return spline.sample(film.grid).masked_fill(unknown, math.nan)
+    def fine(values: Tensor, scale: float, k: int) -> Tensor:
+        spline = VoxelField.through(scale * values, flow.grid)
+        return spline.sample(film.grid).masked_fill(determined[k, 0] < 0.5, math.nan)
 
-        arrays = dict(zip(COMPONENTS, (fine(component, 1e-3) for component in flow.velocity[k]), strict=True))
-        arrays["transport_residual"] = fine(residual[k], 1.0)
-        if flow.pressure is not None and momentum is not None:
-            arrays["pressure"] = fine(flow.pressure[k], density * 1e-6)
-            arrays["momentum_residual"] = fine(momentum[k], 1e-3)
-        store.write_frame(k, arrays)
-    return store
+    check_store(out, FIELDS)
+    with atomic(out) as part:
+        store = VelocitySequence.begin(part, times, film.grid, more, about)
+        for k in range(len(times)):
+            arrays = dict(zip(COMPONENTS, (fine(component, 1e-3, k) for component in flow.velocity[k]), strict=True))
+            arrays["transport_residual"] = fine(residual[k], 1.0, k)
+            if flow.pressure is not None and momentum is not None:
+                arrays["pressure"] = fine(flow.pressure[k], density * 1e-6, k)
+                arrays["momentum_residual"] = fine(momentum[k], 1e-3, k)
+            store.write_frame(k, arrays)
+    return VelocitySequence(out)
 
 
 def _at_instants(values: Float[Tensor, "k z y x"]) -> Float[Tensor, "t z y x"]:

@@ -22,7 +22,7 @@ from typing import Annotated, Literal
 
 import torch
 from annotated_types import Ge, Gt, Lt
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerif.common.conventions import InputError
@@ -36,10 +36,7 @@ from nerif.reconstruction.velocity.transport import Transport
 
 __all__ = ["PHYSICS", "Flow", "Iterate", "State", "VelocityFit"]
 
-PHYSICS = {
-    "boussinesq": "buoyant flow of nearly uniform density",
-    "transport": "the density is carried along by a flow without divergence; no equation of momentum, no pressure",
-}
+PHYSICS = ("boussinesq", "transport")
 LARGEST_DENSITY_CHANGE = 0.3  # of the Boussinesq equations
 LEVELS = (0.67, 1.0)  # voxels along an edge, relative to the finest grid; noise is estimated before each
 SHARES = (0.1, 0.9)  # of the time
@@ -91,7 +88,7 @@ class Flow:
     pressure: Float[Tensor, "t z y x"] | None
     transport: Float[Tensor, "k z y x"]
     momentum: Float[Tensor, "k 3 z y x"] | None
-    determined: Tensor
+    determined: Bool[Tensor, "t z y x"]
     misfit: float
     state: State
 
@@ -211,10 +208,10 @@ class _Problem:
     def __init__(
         self, settings: VelocityFit, theta: Tensor, grid: Grid, times: Sequence[float], coarse: Grid, noise: float
     ) -> None:
-        self.settings, self.times = settings, times
+        self.settings = settings
         self.box = box = PeriodicBox(coarse)
         self.transport = Transport(theta, grid, times, settings.diffusivity, box, noise)
-        self.theta = self.transport.coarse(theta)
+        average = self.transport.coarse(theta)
         buoyant = settings.physics == "boussinesq"
         gravity = settings.gravity if buoyant else (0.0, 0.0, 0.0)
         self.equations = Boussinesq(box, settings.viscosity, gravity)
@@ -224,8 +221,8 @@ class _Problem:
         steepness = float(slope.max().sqrt() / theta.abs().max())
         forcing = settings.forcing if buoyant else 0.5
         amplitude = GAINS * speed * steepness
-        self.prior = VorticityPrior(box, self.theta, amplitude, forcing, settings.correlation, gravity)
-        self.extended = box.extended(self.theta)
+        self.prior = VorticityPrior(box, average, amplitude, forcing, settings.correlation, gravity)
+        self.extended = box.extended(average)
 
     def spectra(self, controls: Tensor) -> list[Tensor]:
         """Return the spectra of the velocity at all instants."""

@@ -25,12 +25,8 @@ def along_axes(values: Float[Tensor, "*c z y x"], matrices: Sequence[Tensor]) ->
 
 def averages(fine: Grid, coarse: Grid, width: float = 0.6) -> list[Tensor]:
     """Return the matrices of Gaussian averages about coarse voxels, `width` of which is the standard deviation."""
-    matrices = []
-    for n, m in zip(fine.shape, coarse.shape, strict=True):
-        centre = (torch.arange(float(m)) + 0.5) * n / m - 0.5
-        weights = torch.exp(-0.5 * ((torch.arange(float(n)) - centre[:, None]) / max(NARROWEST, width * n / m)) ** 2)
-        matrices.append(weights / weights.sum(dim=1, keepdim=True))
-    return matrices
+    pairs = zip(fine.shape, coarse.shape, strict=True)
+    return [_gaussian(n, m, max(NARROWEST, width * n / m)) for n, m in pairs]
 
 
 def interpolations(coarse: Grid, fine: Grid, shape: Sequence[int], first: Sequence[int]) -> list[Tensor]:
@@ -55,12 +51,14 @@ def interpolations(coarse: Grid, fine: Grid, shape: Sequence[int], first: Sequen
 
 def smooth(values: Float[Tensor, "*c z y x"], widths: Sequence[float]) -> Float[Tensor, "*c z y x"]:
     """Return Gaussian averages of standard deviations in voxels along z, y, x."""
-    matrices = []
-    for n, width in zip(values.shape[-3:], widths, strict=True):
-        i = torch.arange(float(n))
-        weights = torch.exp(-0.5 * ((i - i[:, None]) / width) ** 2)
-        matrices.append(weights / weights.sum(dim=1, keepdim=True))
-    return along_axes(values, matrices)
+    return along_axes(values, [_gaussian(n, n, width) for n, width in zip(values.shape[-3:], widths, strict=True)])
+
+
+def _gaussian(n: int, m: int, deviation: float) -> Float[Tensor, "m n"]:
+    """Weights of n voxels about the centres of m, of a standard deviation in the former."""
+    centre = (torch.arange(float(m)) + 0.5) * n / m - 0.5
+    weights = torch.exp(-0.5 * ((torch.arange(float(n)) - centre[:, None]) / deviation) ** 2)
+    return weights / weights.sum(dim=1, keepdim=True)
 
 
 def laplacian(values: Float[Tensor, "*c z y x"], spacing: Sequence[float]) -> Float[Tensor, "*c z y x"]:

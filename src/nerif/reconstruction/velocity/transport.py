@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from functools import cached_property
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerif.fields.grid import VoxelField
@@ -48,7 +48,7 @@ class Transport:
         self, theta: Float[Tensor, "t z y x"], grid: Grid, times: Sequence[float], diffusivity: float,
         box: PeriodicBox, noise: float = 0.0,
     ) -> None:  # fmt: skip
-        self.grid, self.box, self.times = grid, box, times
+        self.grid, self.box = grid, box
         self.intervals = torch.tensor(times).double().diff().float()
         self._down = averages(grid, box.grid)
         self._up = interpolations(box.grid, grid, box.shape, box.first)
@@ -93,7 +93,7 @@ class Transport:
         return noise
 
     @cached_property
-    def region(self) -> Float[Tensor, "t z y x"]:
+    def region(self) -> Bool[Tensor, "t z y x"]:
         """Voxels of the velocity in which the scalar is carried, of each interval."""
         masks = torch.zeros(len(self.intervals), self.grid.shape[0] * self.grid.shape[1] * self.grid.shape[2])
         for mask, place in zip(masks, self.places, strict=True):
