@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shlex
 import shutil
 from pathlib import Path
@@ -19,6 +20,7 @@ from nerif.app.result_table import rows_of
 from nerif.app.result_view import ResultView
 from nerif.app.result_volumes import Film, Still
 from nerif.data.exports import export
+from nerif.data.velocity_sequence import VelocitySequence
 from nerif.data.volume import Volume
 from nerif.data.volume_file import read_volumes
 from nerif.data.volume_sequence import VolumeSequence
@@ -101,6 +103,26 @@ def test_sources_follow_the_files(folder, tmp_path):
     twice = still.volume("index_excess")
     export(copy / "volume.nc", [Volume.of(2 * twice.values, twice.grid, "index_excess", AMBIENT)], force=True)
     assert Still(copy).limits("index_excess")[0] == pytest.approx(2 * before[0])
+
+
+def test_a_velocity_is_a_film_of_speeds(tmp_path):
+    grid = Grid.of_resolution(BOX, 12)
+    store = VelocitySequence.begin(tmp_path / "v.zarr", [0.0, 1e-3], grid, ("pressure", "u_std"), {})
+    x, y, z = grid.points(torch.float32).unbind(-1)
+    for i in range(2):
+        w = (i + 1) * torch.exp(-(x**2 + y**2) / 100).masked_fill(z < z.median(), math.nan)
+        zero = torch.zeros_like(w)
+        store.write_frame(i, {"u": zero, "v": zero, "w": w, "pressure": zero, "u_std": zero + 0.1})
+    film = Film(tmp_path / "v.zarr")
+    assert film.quantities[:4] == ("speed", "vorticity", "u", "u_std")
+    low, high = film.limits("speed")
+    assert low == pytest.approx(0, abs=0.1)
+    assert high == pytest.approx(2, rel=0.2)
+    assert math.isfinite(film.level("speed"))
+    assert film.volume("vorticity", 1).unit == "s-1"
+    project = Project(tmp_path)
+    (row,) = rows_of(project, project.contents())
+    assert row.cells[0] == "velocity, 2 frames"
 
 
 def test_films_are_compared_at_the_same_instants(tmp_path):

@@ -11,6 +11,7 @@ from nerif.geometry import Box, Grid
 from nerif.reconstruction.velocity.boussinesq import Boussinesq
 from nerif.reconstruction.velocity.interpolation import periodic_spline
 from nerif.reconstruction.velocity.periodic_box import PeriodicBox
+from nerif.reconstruction.velocity.problem import resampled
 from nerif.reconstruction.velocity.resampling import laplacian
 from nerif.reconstruction.velocity.transport import Transport
 
@@ -140,3 +141,22 @@ def test_transport_leaves_no_residual_of_a_puff_that_moves_and_spreads(velocity:
         assert float(transport.residual(still).norm()) > 0.9 * size
         assert bool(transport.region.any())
         assert not bool(transport.region.all())
+
+
+@pytest.mark.parametrize("shapes", [((20, 16, 15), (30, 24, 22)), ((30, 24, 22), (15, 12, 11))])
+def test_controls_on_another_grid_stay_in_place(shapes: tuple[tuple[int, int, int], tuple[int, int, int]]):
+    box = Box((0.0, 0.0, 0.0), (75.0, 80.0, 100.0))
+    before, after = (PeriodicBox(Grid(box, shape)) for shape in shapes)
+    centre = torch.tensor([30.0, 55.0, 70.0])
+
+    def blob(grid: Grid) -> torch.Tensor:
+        return torch.exp(-0.5 * ((grid.points(torch.float32) - centre) / 9.0).square().sum(dim=-1))
+
+    values = before.extended(blob(before.grid))[None, None].expand(1, 3, *before.shape)
+    moved = after.inside(resampled(values, before, after))[0, 0]
+    scale = (math.prod(after.spacing) / math.prod(before.spacing)) ** 0.5
+    expected = scale * blob(after.grid)
+    assert float((moved - expected).norm() / expected.norm()) < 0.25
+    weights = moved / moved.sum()
+    points = after.grid.points(torch.float32)
+    torch.testing.assert_close((weights[..., None] * points).sum(dim=(0, 1, 2)), centre, rtol=0, atol=0.5)

@@ -7,11 +7,12 @@ import math
 import pytest
 import torch
 
+import nerif
 from nerif.data.volume import Volume
 from nerif.geometry import Box, Grid
 from nerif.simulation.particles.cloud import Particles
 from nerif.simulation.particles.ring import VortexRing
-from nerif.simulation.particles.velocity import velocity_between
+from nerif.simulation.particles.velocity import velocity_between, write_velocities
 from refusals import refused
 
 RING = VortexRing(radius=4.0, core=1.2, circulation=300.0, centre=(0.5, -1.0, 2.0))
@@ -129,3 +130,18 @@ def empty(grid: Grid) -> Volume:
 def test_invalid_input(call, field):
     with refused(field):
         call()
+
+
+def test_velocities_over_time_are_written_for_movies_and_the_app(tmp_path):
+    pytest.importorskip("zarr", reason="velocities are stored by zarr (the extra `sequence`)")
+    velocity = velocity_between(*shifted((1.0, -0.5, 2.0)), seconds=0.002, window=16, passes=2)
+    store = write_velocities(tmp_path / "v.zarr", [velocity, velocity], (0.0, 0.002))
+    assert store.times == (0.0, 0.002)
+    torch.testing.assert_close(store.vectors(1).double(), 1e-3 * velocity.values.movedim(-1, 0), rtol=1e-5, atol=1e-6,
+                               equal_nan=True)  # fmt: skip
+    torch.testing.assert_close(store.grid.points(torch.float64), velocity.points, rtol=0, atol=1e-6)
+    assert nerif.read(tmp_path / "v.zarr").volume(0, "speed").unit == "m s-1"
+    with refused(tmp_path / "v.zarr"):
+        write_velocities(tmp_path / "v.zarr", [velocity], (0.0,))
+    with refused("times"):
+        write_velocities(tmp_path / "w.zarr", [velocity], (0.0, 1.0))

@@ -13,7 +13,7 @@ from nerif.analysis.evaluation import rms_with_unit
 from nerif.analysis.verdict import verdict
 from nerif.app.project import Contents, Project
 from nerif.common.conventions import InputError
-from nerif.data.volume_sequence import VolumeSequence
+from nerif.data.velocity_sequence import VelocitySequence, open_volumes
 from nerif.reconstruction.files import FIELD
 from nerif.report.movie import finished_frames
 from nerif.report.summary import accuracy_rows
@@ -81,7 +81,7 @@ def _of(name: str, title: str, result: Result) -> Row:
 def _row_of_film(project: Project, name: str) -> Row | None:
     """The row of a film, None for a store of measurements."""
     try:
-        store = VolumeSequence(project.path(name))
+        store = open_volumes(project.path(name))
     except InputError:
         return None
     count, done = len(store), len(finished_frames(store))
@@ -89,7 +89,8 @@ def _row_of_film(project: Project, name: str) -> Row | None:
     outcome = "complete" if done == count else f"{done} of {count} frames"
     grid = " × ".join(str(n) for n in store.grid.shape[::-1])
     figures = (("Frames", f"{done} of {count}"), ("Time", span), ("Voxels", f"{grid} (x, y, z)"))
-    cells = (f"film, {count} frames", "", "", "", outcome, span, "")
+    kind = "velocity" if isinstance(store, VelocitySequence) else "film"
+    cells = (f"{kind}, {count} frames", "", "", "", outcome, span, "")
     return Row(name, project.title(name), cells, "", f"{done} of {count} frames are complete.", figures, film=True)
 
 

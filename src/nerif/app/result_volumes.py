@@ -9,9 +9,9 @@ from typing import Protocol
 
 from nerif.common.conventions import STATISTICS, InputError
 from nerif.common.files import ending
+from nerif.data.velocity_sequence import open_volumes
 from nerif.data.volume import INDEX, Volume
 from nerif.data.volume_file import read_volumes
-from nerif.data.volume_sequence import VolumeSequence
 from nerif.plotting.drawing import colour_range, plotted_values
 from nerif.report.isosurface import default_level
 from nerif.report.movie import finished_frames, ranges_over_time
@@ -77,7 +77,7 @@ class Film:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        store = VolumeSequence(path)
+        store = open_volumes(path)
         self.times, self.frames = store.times, finished_frames(store)
         self.quantities = _display_names(store.quantities)
         if not self.frames:
@@ -110,7 +110,7 @@ def film_progress(path: Path) -> tuple[float, str]:
     if not (path / "zarr.json").is_file():
         return 0.0, ""
     try:
-        store = VolumeSequence(path)
+        store = open_volumes(path)
     except InputError:  # incomplete
         return 0.0, ""
     done, count = len(finished_frames(store)), len(store)
@@ -129,9 +129,9 @@ def _read(path: str, stamp: int) -> dict[str, Volume]:
 
 @lru_cache(maxsize=24)
 def _frame(path: str, stamp: int, quantity: str, frame: int) -> Volume:
-    return coarsen(VolumeSequence(path).volume(frame, quantity))
+    return coarsen(open_volumes(path).volume(frame, quantity))
 
 
 @lru_cache(maxsize=24)
 def _over_time(path: str, stamp: int, quantity: str, frames: tuple[int, ...]) -> tuple[Limits, float]:
-    return ranges_over_time(VolumeSequence(path), quantity, frames)
+    return ranges_over_time(open_volumes(path), quantity, frames)

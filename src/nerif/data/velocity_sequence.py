@@ -16,7 +16,7 @@ from torch import Tensor
 
 from nerif.common.conventions import InputError
 from nerif.data.kinds import VELOCITY, VELOCITY_KIND, kind_of
-from nerif.data.volume import Volume
+from nerif.data.volume import FLOW_QUANTITIES, Volume
 from nerif.data.volume_sequence import VolumeSequence
 from nerif.geometry import Grid
 
@@ -53,7 +53,10 @@ class VelocitySequence(VolumeSequence):
 
     @property
     def quantities(self) -> tuple[str, ...]:
-        return (*super().quantities, *DERIVED)
+        names = [name for base in FLOW_QUANTITIES for name in (base, f"{base}_std")]
+        stored = super().quantities
+        others = [name for name in stored if name not in names]
+        return (*DERIVED, *(name for name in names if name in stored), *others)
 
     def volume(self, index: int, quantity: str) -> Volume:
         if quantity not in DERIVED:

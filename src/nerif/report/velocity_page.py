@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -18,9 +20,15 @@ from nerif.report.velocity_figure import draw_arrows, draw_streamlines
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["render_velocity"]
+__all__ = ["relative_deviation", "render_velocity"]
 
 MAX_FRAMES = 60  # on the page
+VERDICTS = (
+    (0.2, "good", "Use it"),
+    (0.5, "warning", "Use it with care"),
+    (math.inf, "warning", "Do not use it: the film hardly determines the velocity"),
+)
+"""Largest relative standard deviation, kind of statement and verdict."""
 WELL = 1.5  # rms of residual / sigma up to which the velocity explains the film
 
 
@@ -65,6 +73,12 @@ def _statements(store: VelocitySequence) -> list[Statement]:
     else:
         remedy = "give more time (--time-limit), a finer grid (--resolution), or check physics and properties"
         statements = [Statement("warning", f"The velocity explains the film in part: {size}; {remedy}.")]
+    if (spread := relative_deviation(store, COMPONENTS)) is not None:
+        kind, verdict = next((k, words) for limit, k, words in VERDICTS if spread <= limit)
+        of_pressure = relative_deviation(store, ("pressure",))
+        more = "" if of_pressure is None else f", that of the pressure {of_pressure:.0%}"
+        deviation = f"the standard deviation of the velocity is {spread:.0%} of its rms{more}"
+        statements.append(Statement(kind, f"{verdict}: {deviation}; errors of the equations come on top."))
     share = float(np.isfinite(store.read("u", slice(None))).mean())
     where = "elsewhere (grey) the density is uniform, so that nothing shows how the fluid moves"
     statements.append(Statement("note", f"Velocity is given in {share:.0%} of the box; {where}."))
@@ -72,6 +86,17 @@ def _statements(store: VelocitySequence) -> list[Statement]:
         lack = "velocity along surfaces of equal density follows only from continuity and smoothness"
         statements.append(Statement("warning", f"Without an equation of momentum {lack}, and there is no pressure."))
     return statements
+
+
+def relative_deviation(store: VelocitySequence, quantities: Sequence[str]) -> float | None:
+    """Return the rms standard deviation of quantities relative to their rms; None if there is none."""
+    if any(f"{name}_std" not in store.group for name in quantities):
+        return None
+    spread, size = (
+        sum(float(np.nansum(np.square(store.read(f"{name}{end}", slice(None))))) for name in quantities)
+        for end in ("_std", "")
+    )
+    return math.sqrt(spread / size) if size > 0 else None
 
 
 def _film_rows(store: VelocitySequence) -> list[tuple[str, str]]:

@@ -10,6 +10,7 @@ from nerif.common.conventions import InputError
 from nerif.data import kinds
 from nerif.data.measurement import Measurement
 from nerif.data.measurement_sequence import MeasurementSequence
+from nerif.data.velocity_sequence import VelocitySequence
 from nerif.data.volume import Volume
 from nerif.data.volume_file import read_volume
 from nerif.data.volume_sequence import VolumeSequence
@@ -25,6 +26,7 @@ READERS: dict[kinds.Kind, Callable[[Any], Content]] = {
     kinds.VOLUME: read_volume,
     kinds.TRUE_SEQUENCE: VolumeSequence,
     kinds.SEQUENCE_RESULT: VolumeSequence,
+    kinds.VELOCITY: VelocitySequence,
     kinds.RESULT: lambda path: ResultDirectory(path).read(),
     kinds.CALIBRATION: read_cameras,
 }

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -18,19 +18,24 @@ from torch import Tensor
 from nerif.common.conventions import InputError
 from nerif.common.files import atomic, ending
 from nerif.common.interruption import if_interrupted
-from nerif.data.measurement_sequence import check_store
+from nerif.data.measurement_sequence import MeasurementSequence, check_store
 from nerif.data.velocity_sequence import COMPONENTS, VelocitySequence
 from nerif.data.volume import INDEX
 from nerif.data.volume_sequence import FIELDS, VolumeSequence
 from nerif.fields.grid import VoxelField
+from nerif.geometry import Grid
 from nerif.physics.gas_optics import density_from_index, gladstone_dale
 from nerif.physics.quantities import GasSettings
 from nerif.reconstruction.files import digest, read_tensors, write_tensors
-from nerif.reconstruction.velocity.assimilation import Flow, Iterate, State, VelocityFit
+from nerif.reconstruction.projector import Projector
+from nerif.reconstruction.velocity.assimilation import Iterate, State, VelocityFit
+from nerif.reconstruction.velocity.film_density import FilmDensity
+from nerif.reconstruction.velocity.flow import Flow
 
 __all__ = ["densities", "velocity_of_film"]
 
 CHECKPOINT_INTERVAL = 20.0  # s
+DENSITY = ("auto", "improved", "film")
 
 
 def velocity_of_film(
@@ -39,6 +44,8 @@ def velocity_of_film(
     settings: VelocityFit | None = None,
     *,
     frames: tuple[int, int] | None = None,
+    measurement: str | os.PathLike[str] | None = None,
+    density: Literal[*DENSITY] = "auto",  # type: ignore[valid-type]
     force: bool = False,
     on_iterate: Callable[[Iterate], None] = lambda iterate: None,
     say: Callable[[str], None] = lambda line: None,
@@ -53,6 +60,9 @@ def velocity_of_film(
     out : store (.zarr) to write
     settings : of the method
     frames : first one, and the one after the last; None: all
+    measurement : sequence from which the film was reconstructed; None: the one that the film names
+    density : improved (from the displacements of all frames and the velocity), film (as it is), or auto (improved if
+        the measurement is at hand and has displacements of a flow in three dimensions)
     force : overwrite `out`
     on_iterate : called after every iteration
     say : called with lines of text
@@ -60,6 +70,8 @@ def velocity_of_film(
     film, out, settings = Path(film), Path(out), settings or VelocityFit()
     if ending(out) != ".zarr":
         raise InputError(f"expected a name ending in .zarr, got '{out.name}'", field="out")
+    if out.resolve() == film.resolve():
+        raise InputError("expected another place than that of the film", field="out")
     if out.exists() and not force:
         raise InputError("exists already and was left as it is; give another --out, or --force", field=out)
     store = VolumeSequence(film)
@@ -68,15 +80,20 @@ def velocity_of_film(
         raise InputError(f"expected a part of 0 to {len(store)}, got {first} to {last}", field="frames")
     theta, times = densities(store, slice(first, last)), store.times[first:last]
     checkpoint = out.with_suffix(".checkpoint.safetensors")
-    inputs = digest([theta, list(times), _without_limits(settings)])
+    settings.check(theta, store.grid, times)
+    improvement = _improvement(store, theta, slice(first, last), measurement, density, say)
+    displacements = None if improvement is None else improvement.inputs
+    place = [store.grid.box.lower, store.grid.box.upper, store.n_ambient]
+    inputs = digest([theta, list(times), place, _without_limits(settings), displacements])
     state = _resumed(checkpoint, inputs, say)
     saved = time.monotonic()
 
     def update(iterate: Iterate, best: State) -> None:
         nonlocal saved
-        if time.monotonic() - saved > CHECKPOINT_INTERVAL:
-            about = {"inputs": inputs, "level": best.level, "iterations": best.iterations, "seconds": best.seconds}
-            write_tensors(checkpoint, {"controls": best.controls}, about)
+        if best.controls is not None and time.monotonic() - saved > CHECKPOINT_INTERVAL:
+            about = {"inputs": inputs, "stage": best.stage, "iterations": best.iterations, "seconds": best.seconds}
+            tensors = {"controls": best.controls} | ({} if best.theta is None else {"theta": best.theta})
+            write_tensors(checkpoint, tensors, about)
             saved = time.monotonic()
         on_iterate(iterate)
 
@@ -86,13 +103,13 @@ def velocity_of_film(
         return f"the state is kept in {checkpoint}; run the same command again to continue"
 
     with if_interrupted(stopped):
-        flow = settings(theta, store.grid, times, update, state)
-    result = _write(out, store, times, settings, flow)
+        flow = settings(theta, store.grid, times, update, state, improvement)
+    result = _write(out, store, theta, times, settings, flow)
     checkpoint.unlink(missing_ok=True)
     determined = float(flow.determined.float().mean())
     say(
         f"{out}: {len(times)} instants, velocity known in {determined:.0%} of the box, rms residual of transport "
-        f"{flow.misfit:.2f} of its standard deviation, {flow.state.iterations} iterations, {flow.state.seconds:.0f} s"
+        f"{flow.misfit:.2f} of its standard deviation, {flow.iterations} iterations, {flow.seconds:.0f} s"
     )
     return result
 
@@ -118,8 +135,64 @@ def densities(store: VolumeSequence, frames: slice = slice(None)) -> Float[Tenso
     return torch.from_numpy(store.read(INDEX, frames)).float() / (1 - store.n_ambient)
 
 
+def _improvement(
+    film: VolumeSequence, theta: Tensor, frames: slice, measurement: str | os.PathLike[str] | None, density: str,
+    say: Callable[[str], None],
+) -> FilmDensity | None:  # fmt: skip
+    """Return the improvement of the densities by the displacements, None without it."""
+    if density not in DENSITY:
+        raise InputError(f"expected one of {', '.join(DENSITY)}, got '{density}'", field="density")
+    if density == "film":
+        if measurement is not None:
+            raise InputError("expected none with --density film, which does not need it", field="measurement")
+        return None
+    try:
+        return FilmDensity(theta, film.grid, _projectors(film, frames, measurement), film.n_ambient)
+    except InputError as error:
+        if density == "improved" or measurement is not None:
+            raise
+        say(f"densities are those of the film, not improved by its displacements: {error}")
+        return None
+
+
+def _projectors(film: VolumeSequence, frames: slice, measurement: str | os.PathLike[str] | None) -> list[Projector]:
+    """Return the forward projectors of the frames of a film, with its displacements."""
+    about = film.attributes
+    path = measurement or about.get("measurement")
+    if path is None:
+        raise InputError("no measurement is named in it; give --measurement", field=film.path)
+    if about.get("symmetry"):
+        raise InputError("expected a film without symmetry; give --density film", field=film.path)
+    sequence = MeasurementSequence.read(path)
+    if sequence.times[frames] != film.times[frames]:
+        raise InputError(
+            "expected the instants of the film, got others; give another --measurement, or --density film",
+            field=sequence.path,
+        )
+    settings = about.get("settings", {})
+    if settings.get("probes") or settings.get("ambient_region"):
+        raise InputError("its constant is fixed by a region or probes; give --density film", field=film.path)
+    options: dict[str, Any] = {
+        "open_faces": tuple(settings.get("open_faces", ())),
+        "ambient_faces": tuple(settings.get("ambient_faces", ())) or None,
+        "aperture": settings.get("aperture", "auto"),
+    }
+    projectors = []
+    for k in range(*frames.indices(len(sequence))):
+        frame = sequence.frame(k)
+        frame = frame.select([name for name in frame.names if name not in about.get("withhold", ())])
+        if frame.quantity != INDEX:
+            raise InputError(
+                f"expected displacements, got a measurement of {frame.quantity}; give --density film",
+                field=sequence.path,
+            )
+        projectors.append(Projector(frame, film.grid, **options))
+    return projectors
+
+
 def _without_limits(settings: VelocityFit) -> dict[str, Any]:
-    return {name: value for name, value in asdict(settings).items() if name not in ("time_limit", "max_iterations")}
+    later = ("time_limit", "max_iterations", "samples", "sample_iterations")
+    return {name: value for name, value in asdict(settings).items() if name not in later}
 
 
 def _resumed(checkpoint: Path, inputs: str, say: Callable[[str], None]) -> State | None:
@@ -131,45 +204,58 @@ def _resumed(checkpoint: Path, inputs: str, say: Callable[[str], None]) -> State
         say(f"{checkpoint}: of another film or other settings; started again")
         return None
     say(f"continuing after {about['iterations']} iterations")
-    return State(about["level"], tensors["controls"], about["iterations"], about["seconds"])
+    return State(about["stage"], tensors["controls"], tensors.get("theta"), about["iterations"], about["seconds"])
 
 
 def _write(
-    out: Path, film: VolumeSequence, times: Sequence[float], settings: VelocityFit, flow: Flow
+    out: Path, film: VolumeSequence, theta: Tensor, times: Sequence[float], settings: VelocityFit, flow: Flow
 ) -> VelocitySequence:
     """Write a flow on the grid of the film, in SI units."""
     gas = GasSettings(**film.attributes["gas"]) if "gas" in film.attributes else GasSettings()
     constant = gladstone_dale(gas.composition, gas.wavelength_nm)
     density = float(density_from_index(0.0, film.n_ambient, constant))
-    more = ["transport_residual"]
+    more = ["transport_residual", "density"]
     if flow.pressure is not None:
         more += ["pressure", "momentum_residual"]
+    deviations = flow.deviations
+    if deviations is not None:
+        more += [f"{name}_std" for name in COMPONENTS]
+        more += [] if deviations.pressure is None else ["pressure_std"]
     about = {
         "film": str(film.path.resolve()), "n_ambient": film.n_ambient, "physics": settings.physics,
         "viscosity": settings.viscosity * 1e-6, "diffusivity": settings.diffusivity * 1e-6,
         "gravity": [g * 1e-3 for g in settings.gravity], "reference_density": density,
         "units": "viscosity and diffusivity in m2 s-1, gravity in m s-2, reference_density in kg m-3",
-        "settings": asdict(settings), "misfit": flow.misfit, "iterations": flow.state.iterations,
-        "seconds": flow.state.seconds,
+        "density": "film" if flow.theta is None else "improved",
+        "settings": asdict(settings), "misfit": flow.misfit, "iterations": flow.iterations,
+        "seconds": flow.seconds,
     }  # fmt: skip
     resize = torch.nn.functional.interpolate
     determined = resize(flow.determined.float()[:, None], film.grid.shape, mode="nearest-exact")
     residual = _at_instants(flow.transport)
     momentum = None if flow.momentum is None else _at_instants(flow.momentum.norm(dim=1))
 
-    def fine(values: Tensor, scale: float, k: int) -> Tensor:
-        spline = VoxelField.through(scale * values, flow.grid)
+    def fine(values: Tensor, scale: float, k: int, grid: Grid = flow.grid) -> Tensor:
+        spline = VoxelField.through(scale * values, grid)
         return spline.sample(film.grid).masked_fill(determined[k, 0] < 0.5, math.nan)
 
+    theta = theta if flow.theta is None else flow.theta
     check_store(out, FIELDS)
     with atomic(out) as part:
         store = VelocitySequence.begin(part, times, film.grid, more, about)
         for k in range(len(times)):
             arrays = dict(zip(COMPONENTS, (fine(component, 1e-3, k) for component in flow.velocity[k]), strict=True))
+            arrays["density"] = density * (1 - theta[k])
             arrays["transport_residual"] = fine(residual[k], 1.0, k)
             if flow.pressure is not None and momentum is not None:
                 arrays["pressure"] = fine(flow.pressure[k], density * 1e-6, k)
                 arrays["momentum_residual"] = fine(momentum[k], 1e-3, k)
+            if deviations is not None:
+                for name, values in zip(COMPONENTS, deviations.velocity[k], strict=True):
+                    arrays[f"{name}_std"] = fine(values, 1e-3, k, deviations.grid).clamp_min(0)
+                if deviations.pressure is not None:
+                    values = fine(deviations.pressure[k], density * 1e-6, k, deviations.grid)
+                    arrays["pressure_std"] = values.clamp_min(0)
             store.write_frame(k, arrays)
     return VelocitySequence(out)
 

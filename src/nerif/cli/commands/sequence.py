@@ -9,10 +9,12 @@ from typing import Annotated, Literal
 import tyro
 from annotated_types import Ge
 
+from nerif.cli.commands import velocity
 from nerif.cli.commands.output import MONITOR, figures_bar
 from nerif.cli.commands.settings import Flat, Settings, read_settings, setting_of
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.neural.presets import PRESETS, preset
+from nerif.reconstruction.velocity.assimilation import VelocityFit
 from nerif.workflow.sequence.plan import SequenceSettings
 from nerif.workflow.sequence.reconstruct import reconstruct_sequence
 from nerif.workflow.sequence.run import Progress
@@ -49,10 +51,16 @@ class Sequence(Settings):
     """Default settings: fast (CPU), best (GPU), paper, or auto (best with a GPU, else fast)."""
     frames: Annotated[SequenceSettings, Flat] = field(default_factory=SequenceSettings)
     reconstructor: Annotated[NeRIF, Flat] = field(default_factory=NeRIF)
+    velocity: Path | None = None
+    """Velocity (.zarr) to compute from the complete result, as nerif velocity does."""
+    flow: VelocityFit = field(default_factory=VelocityFit)
+    """Its settings."""
 
 
 def run(settings: Sequence) -> SequenceStore:
-    """Reconstruct the missing frames, and print a table of the result."""
+    """Reconstruct the missing frames, and print a table of the result; then compute the velocity, if requested."""
+    if settings.velocity is not None:
+        velocity.check(settings.velocity, settings.out, settings.frames.quantities, settings.force)
     with figures_bar("frames") as bar:
 
         def update(progress: Progress) -> None:
@@ -62,12 +70,15 @@ def run(settings: Sequence) -> SequenceStore:
                 figures += f" | {progress.seconds_left:.0f} s left"
             bar(progress.settled / max(progress.total, 1), figures, progress.seconds)
 
-        return reconstruct_sequence(
+        store = reconstruct_sequence(
             settings.out, settings.measurement, settings.reconstructor, settings.frames,
             cluster=settings.cluster, workers=settings.workers, threads=settings.threads,
             dashboard=settings.dashboard, retry=settings.retry, force=settings.force, on_progress=update,
             say=MONITOR.say,
         )  # fmt: skip
+    if settings.velocity is not None:
+        velocity.run(velocity.Velocity(settings.out, settings.velocity, force=settings.force, fit=settings.flow))
+    return store
 
 
 def main(arguments: list[str]) -> None:

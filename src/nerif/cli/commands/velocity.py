@@ -4,19 +4,21 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
 from nerif.cli.arguments import check_output
 from nerif.cli.commands.output import MONITOR, figures_bar
 from nerif.cli.commands.settings import Flat, Settings, command
+from nerif.common.conventions import InputError
 from nerif.data.velocity_sequence import VelocitySequence
+from nerif.data.volume import INDEX
 from nerif.reconstruction.velocity.assimilation import Iterate, VelocityFit
 from nerif.workflow.reports import write_sequence_report
-from nerif.workflow.velocity import velocity_of_film
+from nerif.workflow.velocity import DENSITY, velocity_of_film
 
-__all__ = ["Velocity", "main", "run"]
+__all__ = ["Velocity", "check", "main", "run"]
 
 
 @dataclass(frozen=True)
@@ -32,9 +34,22 @@ class Velocity(Settings):
     """Velocity (.zarr) to write; its report lies beside it."""
     frames: tuple[int, int] | None = None
     """First frame, and the one after the last (default: all)."""
+    measurement: Path | None = None
+    """Measurement sequence (.zarr) of the film (default: the one that the film names)."""
+    density: Literal[*DENSITY] = "auto"  # type: ignore[valid-type]
+    """Improved from the displacements of all frames and the velocity, film (as it is), or auto (if possible)."""
     force: bool = False
     """Overwrite an existing result."""
     fit: Annotated[VelocityFit, Flat] = field(default_factory=VelocityFit)
+
+
+def check(out: Path, film: Path, quantities: tuple[str, ...], force: bool) -> None:
+    """Check before a film is reconstructed whether its velocity can be computed and written."""
+    if out.resolve() == film.resolve():
+        raise InputError("expected another place than that of the film", field="velocity")
+    if quantities and INDEX not in quantities:
+        raise InputError(f"expected {INDEX} among them, which the velocity is computed from", field="quantities")
+    check_output(out, force, endings=(".zarr",))
 
 
 def run(settings: Velocity) -> VelocitySequence:
@@ -43,10 +58,10 @@ def run(settings: Velocity) -> VelocitySequence:
     with figures_bar("velocity") as bar:
 
         def update(iterate: Iterate) -> None:
-            figures = f"grid {iterate.level + 1}/{iterate.levels} | iteration {iterate.iterations} | "
+            figures = f"{iterate.what}, stage {iterate.stage + 1}/{iterate.stages} | iteration {iterate.iterations} | "
             figures += f"residual {iterate.misfit:.2f} sigma | {iterate.seconds:.0f} s"
             limit = settings.fit.time_limit
-            done = min(iterate.seconds / limit, 1.0) if limit else iterate.level / iterate.levels
+            done = min(iterate.seconds / limit, 0.99) if limit else iterate.stage / iterate.stages
             bar(done, figures, iterate.seconds)
 
         result = velocity_of_film(
@@ -54,6 +69,8 @@ def run(settings: Velocity) -> VelocitySequence:
             settings.out,
             settings.fit,
             frames=settings.frames,
+            measurement=settings.measurement,
+            density=settings.density,
             force=settings.force,
             on_iterate=update,
             say=MONITOR.say,

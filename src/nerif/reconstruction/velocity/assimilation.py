@@ -16,85 +16,73 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
-from contextlib import suppress
-from dataclasses import dataclass
-from typing import Annotated, Literal
+from dataclasses import dataclass, replace
+from typing import Annotated, Literal, Protocol
 
 import torch
 from annotated_types import Ge, Gt, Lt
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from nerif.common.conventions import InputError
 from nerif.common.settings import Count, Positive, check_settings
 from nerif.geometry import Grid
-from nerif.reconstruction.velocity.boussinesq import Boussinesq
-from nerif.reconstruction.velocity.periodic_box import PeriodicBox
-from nerif.reconstruction.velocity.prior import VorticityPrior
-from nerif.reconstruction.velocity.resampling import along_axes, averages
+from nerif.reconstruction.velocity.deviations import deviations_of
+from nerif.reconstruction.velocity.flow import Flow
+from nerif.reconstruction.velocity.problem import Problem, minimise, resampled
 from nerif.reconstruction.velocity.transport import Transport
 
-__all__ = ["PHYSICS", "Flow", "Iterate", "State", "VelocityFit"]
+__all__ = ["PHYSICS", "Improvement", "Iterate", "State", "VelocityFit"]
 
 PHYSICS = ("boussinesq", "transport")
 LARGEST_DENSITY_CHANGE = 0.3  # of the Boussinesq equations
-LEVELS = (0.67, 1.0)  # voxels along an edge, relative to the finest grid; noise is estimated before each
-SHARES = (0.1, 0.9)  # of the time
-MIN_VOXELS = 8
-HISTORY = 60  # steps that L-BFGS remembers
-ENOUGH = 0.7  # rms of residual / sigma at which a level ends
-GAINS = 2.0  # vorticity, relative to that of a flow which changes the density at the rate in the film
+STAGES = ((0.67, 0.1), (1.0, 0.8))
+"""Voxels along an edge, relative to the finest grid, and the share of the time at which the stage ends."""
+STAGES_WITH_DENSITY = ((0.67, 0.08), (0.67, 0.22), (1.0, 0.48), (1.0, 0.8))
+"""The same where the density is improved between stages."""
+MIN_VOXELS, MIN_FILM_VOXELS = 8, 4  # along the longest edge of the velocity; along each edge
+IMPROVEMENT = 0.4  # of the time left to a stage, for better densities before it
+SAMPLED = 0.5  # voxels along an edge of the grid of standard deviations, relative to the finest
+
+
+class Improvement(Protocol):
+    """Returns theta of a film, given the transport of its present densities and the splines of the velocity."""
+
+    def __call__(
+        self, transport: Transport, splines: Tensor, on_iterate: Callable[[int, float], bool]
+    ) -> Float[Tensor, "t z y x"]: ...
 
 
 @dataclass(frozen=True)
 class State:
-    """Where a fit is: its level, the controls, and iterations and seconds so far."""
+    """Where a fit is: its stage, the controls, theta if it was improved, iterations and seconds so far."""
 
-    level: int
-    controls: Float[Tensor, "t 3 z y x"]
+    stage: int = 0
+    controls: Float[Tensor, "t 3 z y x"] | None = None
+    theta: Float[Tensor, "t z y x"] | None = None
     iterations: int = 0
     seconds: float = 0.0
 
 
 @dataclass(frozen=True)
 class Iterate:
-    """Figures of an iteration: level and their number, iterations and seconds so far, rms of residual / sigma."""
-
-    level: int
-    levels: int
-    iterations: int
-    seconds: float
-    misfit: float
-
-
-@dataclass(frozen=True)
-class Flow:
-    """Velocity and pressure on a grid at the instants of a film.
+    """Figures of an iteration.
 
     Parameters
     ----------
-    grid : voxels, mm
-    velocity : along x, y, z, mm/s
-    pressure : over the reference density, up to a constant, mm^2/s^2; None: not determined by the physics
-    transport : residual of the transport of theta in each interval, 1/s
-    momentum : change of momentum that the equations do not explain in each interval, mm/s^2; None as above
-    determined : voxels in which the density is carried, so that the velocity is known
-    misfit : rms of residual / sigma
-    state : of the fit
+    what : velocity, density, or deviations
+    stage, stages : number of the stage from 0, and their count
+    iterations : so far
+    seconds : so far
+    misfit : rms of residual / sigma, of density that of the displacements
     """
 
-    grid: Grid
-    velocity: Float[Tensor, "t 3 z y x"]
-    pressure: Float[Tensor, "t z y x"] | None
-    transport: Float[Tensor, "k z y x"]
-    momentum: Float[Tensor, "k 3 z y x"] | None
-    determined: Bool[Tensor, "t z y x"]
+    what: str
+    stage: int
+    stages: int
+    iterations: int
+    seconds: float
     misfit: float
-    state: State
-
-
-class _End(Exception):
-    """A limit is reached."""
 
 
 @dataclass(frozen=True)
@@ -122,12 +110,18 @@ class VelocityFit:
     correlation: Positive = 20.0
     """Wavelength below which the vorticity is expected to be smaller, mm."""
 
+    samples: Annotated[int, Ge(0)] = 6
+    """Samples of the flow, from which standard deviations are computed (0: none)."""
+    sample_iterations: Count = 40
+    """Iterations of each sample."""
+
     def __post_init__(self) -> None:
         check_settings(self)
 
     def __call__(
         self, theta: Float[Tensor, "t z y x"], grid: Grid, times: Sequence[float],
         on_iterate: Callable[[Iterate, State], None] = lambda iterate, state: None, resume: State | None = None,
+        improve: Improvement | None = None,
     ) -> Flow:  # fmt: skip
         """Return velocity and pressure of a film.
 
@@ -138,43 +132,80 @@ class VelocityFit:
         times : s
         on_iterate : called after every evaluation, with the best state so far
         resume : state of an earlier run with the same input and settings
+        improve : returns better densities, given the velocity; called between stages
         """
         theta = theta.float()
-        self._check(theta, grid, times)
-        levels = self._levels(grid)
-        noise = self.density_noise or noise_of(theta, grid, levels[-1])
-        begin = time.monotonic() - (resume.seconds if resume else 0.0)
-        first = resume.level if resume else 0
-        controls = resume.controls if resume else None
-        iterations = resume.iterations if resume else 0
-        before: _Problem | None = None
-        for level in range(first, len(levels)):
-            problem = _Problem(self, theta, grid, times, levels[level], noise)
-            if controls is None:
+        self.check(theta, grid, times)
+        stages = STAGES if improve is None else STAGES_WITH_DENSITY
+        state = resume or State()
+        first, begin = state.stage, time.monotonic() - state.seconds
+        limit = self.time_limit or math.inf
+
+        def report(what: str, misfit: float, state: State) -> float:
+            seconds = time.monotonic() - begin
+            state = replace(state, seconds=seconds)
+            on_iterate(Iterate(what, state.stage, len(stages), state.iterations, seconds, misfit), state)
+            return seconds
+
+        problem: Problem | None = None
+        for stage in range(first, len(stages)):
+            share, end = stages[stage]
+            if improve is not None and problem is not None:
+                spent = time.monotonic() - begin
+                latest = spent + IMPROVEMENT * (end * limit - spent)
+
+                def improved(iteration: int, misfit: float, state: State = state, latest: float = latest) -> bool:
+                    return report("density", misfit, state) > latest
+
+                with torch.no_grad():
+                    splines = problem.splines(problem.spectra(_controls(state)))
+                state = replace(state, theta=improve(problem.transport, splines, improved))
+            before, density = problem, theta if state.theta is None else state.theta
+            problem = Problem(self, density, grid, times, self._grid(grid, share))
+            if state.controls is None:
                 controls = torch.zeros(len(times), 3, *problem.box.shape)
             else:
-                if before is not None:
-                    controls = _finer(controls, before.box, problem.box)
+                controls = state.controls if before is None else resampled(state.controls, before.box, problem.box)
                 problem.weigh(controls)
-            limit = self.time_limit * sum(SHARES[: level + 1]) if self.time_limit else math.inf
+            state = replace(state, stage=stage, controls=controls)
 
-            def report(misfit: float, best: Tensor, done: int, level: int = level) -> float:
-                seconds = time.monotonic() - begin
-                on_iterate(Iterate(level, len(levels), done, seconds, misfit), State(level, best, done, seconds))
-                return seconds
+            def progress(misfit: float, best: Tensor, done: int, state: State = state) -> float:
+                return report("velocity", misfit, replace(state, controls=best, iterations=done))
 
-            controls, iterations = _minimise(problem, controls, self.max_iterations, iterations, limit, report)
-            before = problem
-        assert before is not None
-        assert controls is not None
-        state = State(len(levels) - 1, controls, iterations, time.monotonic() - begin)
-        return before.flow(controls, state)
+            controls, done = minimise(problem, controls, self.max_iterations, state.iterations, end * limit, progress)
+            state = replace(state, controls=controls, iterations=done)
+        assert problem is not None
+        flow = problem.flow(_controls(state))
+        deviations = None
+        if self.samples:
+            coarse = Problem(
+                self, theta if state.theta is None else state.theta, grid, times, self._grid(grid, SAMPLED)
+            )
+            around = resampled(_controls(state), problem.box, coarse.box)
+            deviations = deviations_of(
+                coarse, around, self.samples, self.sample_iterations,
+                lambda misfit: report("deviations", misfit, state), limit,
+            )  # fmt: skip
+        seconds = time.monotonic() - begin
+        return replace(flow, theta=state.theta, deviations=deviations, iterations=state.iterations, seconds=seconds)
 
-    def _check(self, theta: Tensor, grid: Grid, times: Sequence[float]) -> None:
+    def check(self, theta: Tensor, grid: Grid, times: Sequence[float]) -> None:
+        """Check the densities of a film, as for a call.
+
+        Raises
+        ------
+        InputError
+            For less than three frames, thin boxes, NaN, densities that do not vary, and those outside the physics.
+        """
         if len(times) < 3:
             raise InputError(f"expected three frames or more, got {len(times)}", field="film")
         if tuple(theta.shape) != (len(times), *grid.shape):
             raise InputError(f"expected densities of shape {(len(times), *grid.shape)}, got {tuple(theta.shape)}")
+        if min(grid.shape) < MIN_FILM_VOXELS:
+            raise InputError(
+                f"expected {MIN_FILM_VOXELS} voxels or more along each edge, got {grid.shape} (z, y, x); run nerif "
+                "sequence with more --voxels", field="film",
+            )  # fmt: skip
         if not bool(torch.isfinite(theta).all()):
             raise InputError(
                 "expected densities everywhere, got NaN: these equations have no bodies in the flow", field="film"
@@ -188,136 +219,16 @@ class VelocityFit:
                 "release or a hot gas, whose expansion these equations lack; give --physics transport for an estimate",
                 field="physics",
             )
+        if not float((theta[1:] - theta[:-1]).abs().max()) > 0:
+            raise InputError("the density does not change in time, so that nothing shows the velocity", field="film")
 
-    def _levels(self, grid: Grid) -> list[Grid]:
-        counts = [max(MIN_VOXELS, round(self.resolution * share)) for share in LEVELS]
-        return [Grid.of_resolution(grid.box, min(n, max(grid.shape))) for n in counts]
-
-
-def noise_of(theta: Float[Tensor, "t z y x"], grid: Grid, coarse: Grid) -> float:
-    """Return the standard deviation of a film's averages where the fluid is ambient: where the scalar is smallest."""
-    average = along_axes(theta, averages(grid, coarse))
-    strength = average.abs().amax(dim=0)
-    calm = strength <= strength.quantile(0.5)
-    return float(average[:, calm].square().mean().sqrt())
+    def _grid(self, grid: Grid, share: float) -> Grid:
+        count = max(MIN_VOXELS, round(self.resolution * share))
+        shape = Grid.of_resolution(grid.box, min(count, max(grid.shape))).shape
+        nz, ny, nx = (max(n, MIN_FILM_VOXELS) for n in shape)
+        return Grid(grid.box, (nz, ny, nx))
 
 
-class _Problem:
-    """The fit on one grid."""
-
-    def __init__(
-        self, settings: VelocityFit, theta: Tensor, grid: Grid, times: Sequence[float], coarse: Grid, noise: float
-    ) -> None:
-        self.settings = settings
-        self.box = box = PeriodicBox(coarse)
-        self.transport = Transport(theta, grid, times, settings.diffusivity, box, noise)
-        average = self.transport.coarse(theta)
-        buoyant = settings.physics == "boussinesq"
-        gravity = settings.gravity if buoyant else (0.0, 0.0, 0.0)
-        self.equations = Boussinesq(box, settings.viscosity, gravity)
-        rate = (theta[1:] - theta[:-1]).square().mean().sqrt() / float(self.transport.intervals.mean())
-        slope = torch.stack(torch.gradient(theta, spacing=grid.spacing[::-1], dim=(1, 2, 3))).square().sum(dim=0)
-        speed = float(rate / slope.mean().sqrt())
-        steepness = float(slope.max().sqrt() / theta.abs().max())
-        forcing = settings.forcing if buoyant else 0.5
-        amplitude = GAINS * speed * steepness
-        self.prior = VorticityPrior(box, average, amplitude, forcing, settings.correlation, gravity)
-        self.extended = box.extended(average)
-
-    def spectra(self, controls: Tensor) -> list[Tensor]:
-        """Return the spectra of the velocity at all instants."""
-        vorticity = self.prior.vorticity(controls).unbind()  # unbound, derivatives of slices stay small
-        start, *changes = (self.box.velocity(w) for w in vorticity)
-        return self.equations.solve(start, self.extended, self.transport.intervals.tolist(), changes)
-
-    @torch.no_grad()
-    def weigh(self, controls: Tensor) -> None:
-        """Set the standard deviation of the residual by the noise that it shows."""
-        residual = self.residual(self.spectra(controls)) * self.transport.deviation
-        self.transport.weigh(residual)
-
-    def residual(self, velocities: list[Tensor]) -> Tensor:
-        """Return residual / sigma of every interval."""
-        splines = torch.stack([self.box.spline(v) for v in velocities])
-        return self.transport.residual(splines) / self.transport.deviation
-
-    def loss(self, controls: Tensor) -> tuple[Tensor, float]:
-        """Return the objective, and the rms of residual / sigma where much of the scalar is."""
-        residual = self.residual(self.spectra(controls))
-        misfit = float(residual.detach()[self.transport.core].square().mean().sqrt())
-        return 0.5 * residual.square().sum() + 0.5 * controls.square().sum(), misfit
-
-    @torch.no_grad()
-    def flow(self, controls: Tensor, state: State) -> Flow:
-        """Return the flow of controls, on the grid of the velocity."""
-        box, intervals = self.box, self.transport.intervals[:, None, None, None]
-        spectra = self.spectra(controls)
-        residual = self.residual(spectra)
-        misfit = float(residual[self.transport.core].square().mean().sqrt())
-        pressure = momentum = None
-        if self.settings.physics == "boussinesq":
-            vorticity = self.prior.vorticity(controls)
-            change = torch.stack([box.inside(box.values(box.velocity(w))) for w in vorticity[1:]])
-            momentum = change / intervals[:, None]
-            pressure = self._pressure(spectra)
-        region = self.transport.region
-        determined = torch.cat([region[:1], region[1:] | region[:-1], region[-1:]])
-        return Flow(
-            box.grid, torch.stack([box.inside(box.values(u)) for u in spectra]), pressure,
-            residual * self.transport.deviation / intervals, momentum, determined, misfit, state,
-        )  # fmt: skip
-
-    def _pressure(self, spectra: list[Tensor]) -> Tensor:
-        """Return the pressure at the instants, mm^2/s^2, of mean 0 in the box."""
-        pressures = [self.equations.pressure(u, theta) for u, theta in zip(spectra, self.extended, strict=True)]
-        inside = self.box.inside(torch.stack(pressures))
-        return inside - inside.mean(dim=(1, 2, 3), keepdim=True)
-
-
-def _minimise(
-    problem: _Problem, controls: Tensor, max_iterations: int, before: int, limit: float,
-    report: Callable[[float, Tensor, int], float],
-) -> tuple[Tensor, int]:  # fmt: skip
-    """Return the best controls, and the number of evaluations, until a limit or a residual of the size of sigma."""
-    x = controls.clone().requires_grad_()
-    optimiser = torch.optim.LBFGS(
-        [x], max_iter=max_iterations, max_eval=10 * max_iterations, history_size=HISTORY,
-        tolerance_grad=0, tolerance_change=0, line_search_fn="strong_wolfe",
-    )  # fmt: skip
-    best, lowest, done = controls, math.inf, before
-
-    def closure() -> Tensor:
-        nonlocal best, lowest, done
-        optimiser.zero_grad()
-        loss, misfit = problem.loss(x)
-        loss.backward()
-        done += 1
-        if loss.item() < lowest:
-            best, lowest = x.detach().clone(), loss.item()
-        if report(misfit, best, done) > limit or misfit < ENOUGH:
-            raise _End
-        return loss
-
-    with suppress(_End):
-        optimiser.step(closure)
-    return best, done
-
-
-def _finer(controls: Tensor, coarse: PeriodicBox, fine: PeriodicBox) -> Tensor:
-    """Return controls on a finer grid, whose waves beyond those of the coarse one are 0."""
-    spectrum = coarse.spectrum(controls)
-    result = torch.zeros(*spectrum.shape[:2], *fine.shape[:2], fine.shape[2] // 2 + 1, dtype=spectrum.dtype)
-    places = []
-    for axis, (m, n) in enumerate(zip(coarse.shape, fine.shape, strict=True)):
-        half = (min(m, n) + 1) // 2
-        negative = [] if axis == 2 else list(range(-half + 1, 0))
-        places.append(
-            (
-                torch.tensor([*range(half), *(m + k for k in negative)]),
-                torch.tensor([*range(half), *(n + k for k in negative)]),
-            )
-        )
-    (z0, z1), (y0, y1), (x0, x1) = places
-    part = spectrum[:, :, z0][:, :, :, y0][..., x0]
-    result[:, :, z1[:, None, None], y1[:, None], x1] = part
-    return fine.values(result) * math.sqrt(math.prod(fine.shape) / math.prod(coarse.shape))
+def _controls(state: State) -> Tensor:
+    assert state.controls is not None
+    return state.controls

@@ -7,18 +7,19 @@ Source: Unser, Splines: a perfect fit for signal and image processing, IEEE Sign
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from nerif.fields.grid import VoxelField
-from nerif.fields.spline_kernel import CUBIC, evaluate
-from nerif.reconstruction.velocity.kernels import LAYERS, interpolate, spread
+from nerif.fields.spline_kernel import evaluate
+from nerif.reconstruction.velocity.kernels import CHANNELS, LAYERS, interpolate, spread
 
-__all__ = ["fixed_spline", "periodic_spline"]
+__all__ = ["fixed_splines", "periodic_spline"]
 
 
 def periodic_spline(coefficients: Float[Tensor, "c z y x"], points: Float[Tensor, "n 3"]) -> Float[Tensor, "c n"]:
@@ -26,60 +27,73 @@ def periodic_spline(coefficients: Float[Tensor, "c z y x"], points: Float[Tensor
 
     Parameters
     ----------
-    coefficients : at the nodes
+    coefficients : at the nodes, of four channels at most
     points : x, y, z in nodes from the first one
     """
     return _Periodic.apply(coefficients, points)
 
 
-def fixed_spline(field: VoxelField, points: Float[Tensor, "n 3"]) -> Float[Tensor, n]:
-    """Return the values of a field at points (mm), differentiable by the points only."""
-    return _Fixed.apply(points, field)
+def fixed_splines(fields: Sequence[VoxelField], points: Sequence[Float[Tensor, "n 3"]]) -> tuple[Tensor, ...]:
+    """Return the values of fields, each at its own points (mm), differentiable by the points only."""
+    return _Fixed.apply(fields, *points)
 
 
 class _Periodic(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, coefficients: Tensor, points: Tensor) -> Tensor:
-        c, p = _around(coefficients.detach()), points.detach().contiguous()
+        channels, p = len(coefficients), points.detach().contiguous()
+        c = _around(coefficients.detach())
         ctx.save_for_backward(c, p)
-        values = np.empty((len(c), len(p)), dtype=np.float32)
-        interpolate(c.numpy(), p.numpy(), values, CUBIC)
-        return torch.from_numpy(values)
+        ctx.channels = channels
+        values = torch.empty(len(p), CHANNELS)
+        interpolate(c.numpy(), p.numpy(), values.numpy())
+        return values.T[:channels]
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor]:
         c, p = ctx.saved_tensors
-        by_coefficients = np.zeros(c.shape, dtype=np.float32)
-        by_points = np.empty((len(c), *p.shape), dtype=np.float32)  # one for each thread
-        spread(c.numpy(), p.numpy(), gradients[0].contiguous().numpy(), by_coefficients, by_points, CUBIC)
-        return _folded(torch.from_numpy(by_coefficients)), torch.from_numpy(by_points).sum(dim=0)
+        gradient = torch.zeros(len(p), CHANNELS)
+        gradient[:, : ctx.channels] = gradients[0].T
+        by_coefficients = torch.zeros(torch.get_num_threads(), *c.shape)
+        by_points = torch.empty_like(p)
+        spread(c.numpy(), p.numpy(), gradient.numpy(), by_coefficients.numpy(), by_points.numpy())
+        return _folded(by_coefficients.sum(dim=0))[: ctx.channels], by_points
 
 
-def _around(values: Tensor) -> Tensor:
-    """Repeat the first layers of each axis at its end."""
-    for axis in (1, 2, 3):
-        values = torch.cat([values, values.narrow(axis, 0, LAYERS)], dim=axis)
-    return values.contiguous()
+def _around(values: Float[Tensor, "c z y x"]) -> Float[Tensor, "zl yl xl 4"]:
+    """Put channels last, with zeros for lacking ones, and repeat the first layers of each axis at its end."""
+    nz, ny, nx = values.shape[1:]
+    result = torch.zeros(nz + LAYERS, ny + LAYERS, nx + LAYERS, CHANNELS)
+    result[:nz, :ny, :nx, : len(values)] = values.permute(1, 2, 3, 0)
+    result[:nz, :ny, nx:] = result[:nz, :ny, :LAYERS]
+    result[:nz, ny:] = result[:nz, :LAYERS]
+    result[nz:] = result[:LAYERS]
+    return result
 
 
-def _folded(values: Tensor) -> Tensor:
+def _folded(values: Float[Tensor, "zl yl xl 4"]) -> Float[Tensor, "4 z y x"]:
     """Apply the adjoint of `_around`."""
-    for axis in (1, 2, 3):
+    for axis in range(3):
         n = values.shape[axis] - LAYERS
-        inner = values.narrow(axis, 0, n).clone()
+        inner = values.narrow(axis, 0, n)
         inner.narrow(axis, 0, LAYERS).add_(values.narrow(axis, n, LAYERS))
         values = inner
-    return values
+    return values.permute(3, 0, 1, 2).contiguous()
 
 
 class _Fixed(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, points: Tensor, field: VoxelField) -> Tensor:
-        box = field.grid.box
-        corners = box.lower, box.upper, field.grid.spacing
-        values, ctx.slope = evaluate(field.coefficients, field.degree, points.detach(), *corners)
+    def forward(ctx: Any, fields: Sequence[VoxelField], *points: Tensor) -> tuple[Tensor, ...]:
+        def at(field: VoxelField, places: Tensor) -> tuple[Tensor, Tensor]:
+            box = field.grid.box
+            corners = box.lower, box.upper, field.grid.spacing
+            return evaluate(field.coefficients, field.degree, places.detach(), *corners)
+
+        with ThreadPoolExecutor(torch.get_num_threads()) as pool:  # the kernel has one thread
+            values, slopes = zip(*pool.map(at, fields, points), strict=True)
+        ctx.slopes = slopes
         return values
 
     @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None]:
-        return gradients[0][:, None] * ctx.slope, None
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        return None, *(g[:, None] * slope for g, slope in zip(gradients, ctx.slopes, strict=True))

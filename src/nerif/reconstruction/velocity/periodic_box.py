@@ -14,6 +14,7 @@ from nerif.geometry import Grid
 __all__ = ["PeriodicBox"]
 
 AXES = (-3, -2, -1)
+MIN_LAYERS = 2  # of voxels in a margin
 
 
 class PeriodicBox:
@@ -27,11 +28,14 @@ class PeriodicBox:
     margin : width of the layer on each side, as a fraction of the edge of the box; 0: the box itself is periodic
     """
 
-    def __init__(self, grid: Grid, margin: float = 0.3) -> None:
+    def __init__(self, grid: Grid, margin: float = 0.2) -> None:
         from scipy.fft import next_fast_len
 
         self.grid = grid
-        self.shape = tuple(next_fast_len(n + 2 * round(margin * n), real=True) for n in grid.shape)
+        self.shape = grid.shape
+        if margin > 0:
+            layers = [max(MIN_LAYERS, round(margin * n)) for n in grid.shape]
+            self.shape = tuple(next_fast_len(n + 2 * m, real=True) for n, m in zip(grid.shape, layers, strict=True))
         self.first = tuple((m - n) // 2 for m, n in zip(self.shape, grid.shape, strict=True))
         """Voxels before the box, along z, y, x."""
         self.spacing = grid.spacing[::-1]
@@ -85,6 +89,20 @@ class PeriodicBox:
     def gradient(self, spectrum: Complex[Tensor, "z y xr"]) -> Float[Tensor, "3 z y x"]:
         """Return the gradient of a scalar, per mm."""
         return self.values(1j * self.wave * spectrum)
+
+    def low_pass(self, wavelength: float) -> Float[Tensor, "z y xr"]:
+        """Return the response (1 + (k L / 2 pi)^2)^-1, scaled so that white fields keep their variance.
+
+        Parameters
+        ----------
+        wavelength : L, mm
+        """
+        response = 1 / (1 + self.wave_square * (wavelength / (2 * math.pi)) ** 2)
+        twice = torch.full_like(response, 2.0)
+        twice[..., 0] = 1  # the spectrum holds half of the waves
+        if self.shape[2] % 2 == 0:
+            twice[..., -1] = 1
+        return response / ((twice * response.square()).sum() / math.prod(self.shape)).sqrt()
 
     def inside(self, values: Float[Tensor, "*c z y x"]) -> Float[Tensor, "*c z y x"]:
         """Return the part in the box of the measurement."""

@@ -11,7 +11,7 @@ from torch import Tensor
 from nerif.fields.grid import spline_weights
 from nerif.geometry import Grid
 
-__all__ = ["along_axes", "averages", "interpolations", "laplacian", "smooth"]
+__all__ = ["along_axes", "averages", "interpolations", "laplacian", "periodic_averages", "periodic_splines", "smooth"]
 
 NARROWEST = 1.2  # standard deviation of an average, voxels: finer waves of a density are below the resolution of a film
 
@@ -39,14 +39,25 @@ def interpolations(coarse: Grid, fine: Grid, shape: Sequence[int], first: Sequen
     """
     matrices = []
     for n, m, count, before in zip(fine.shape, coarse.shape, shape, first, strict=True):
-        position = (torch.arange(float(n)) + 0.5) * m / n - 0.5 + before
-        cell = position.floor()
-        weights, _ = spline_weights(position - cell, 3)
-        matrix = torch.zeros(n, count)
-        for k in range(4):
-            matrix[torch.arange(n), (cell.long() - 1 + k) % count] += weights[:, k]
-        matrices.append(matrix)
+        matrices.append(periodic_splines((torch.arange(float(n)) + 0.5) * m / n - 0.5 + before, count))
     return matrices
+
+
+def periodic_splines(positions: Float[Tensor, n], count: int) -> Float[Tensor, "n count"]:
+    """Return the matrix that evaluates a periodic spline of `count` coefficients at positions in voxels."""
+    cell = positions.floor()
+    weights, _ = spline_weights(positions - cell, 3)
+    matrix = torch.zeros(len(positions), count)
+    for k in range(4):
+        matrix[torch.arange(len(positions)), (cell.long() - 1 + k) % count] += weights[:, k]
+    return matrix
+
+
+def periodic_averages(positions: Float[Tensor, n], count: int, deviation: float) -> Float[Tensor, "n count"]:
+    """Return the matrix of Gaussian averages of periodic values about positions in voxels."""
+    distance = (torch.arange(float(count)) - positions[:, None] + count / 2) % count - count / 2
+    weights = torch.exp(-0.5 * (distance / deviation) ** 2)
+    return weights / weights.sum(dim=1, keepdim=True)
 
 
 def smooth(values: Float[Tensor, "*c z y x"], widths: Sequence[float]) -> Float[Tensor, "*c z y x"]:

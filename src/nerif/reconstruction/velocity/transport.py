@@ -10,25 +10,43 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from nerif.fields.grid import VoxelField
 from nerif.geometry import Grid
-from nerif.reconstruction.velocity.interpolation import fixed_spline
+from nerif.reconstruction.velocity.interpolation import fixed_splines
 from nerif.reconstruction.velocity.periodic_box import PeriodicBox
 from nerif.reconstruction.velocity.resampling import along_axes, averages, interpolations, laplacian, smooth
 
-__all__ = ["Transport"]
+__all__ = ["Path", "Transport"]
 
 LEAST = 0.01  # of the largest theta: below, nothing visible is carried
 STRONG = 0.05  # of the largest theta
 REACH = 5  # voxels around the scalar at which the residual is evaluated
 MODEL_ERROR = 0.03  # of the local change of theta per interval, that velocities on a grid leave
 ROUNDING = 3.5e-4  # of the largest theta
+
+
+@dataclass(frozen=True)
+class Path:
+    """Paths of fluid over an interval that begin and end in the box.
+
+    Parameters
+    ----------
+    place : voxel halfway, of all in the volume
+    inside : which of the points of the interval have such a path
+    start, end : x, y, z in voxels from the second layer beyond the faces
+    """
+
+    place: Int[Tensor, n]
+    inside: Bool[Tensor, m]
+    start: Float[Tensor, "n 3"]
+    end: Float[Tensor, "n 3"]
 
 
 class Transport:
@@ -67,8 +85,8 @@ class Transport:
             self.gains.append(gain[k].reshape(-1)[place])
         self.core = self.coarse(torch.maximum(theta[1:].abs(), theta[:-1].abs())) > STRONG * largest
         """Voxels of the velocity in which much of the scalar is, of each interval: those of the misfit."""
-        change = self.coarse(theta[1:] - theta[:-1])
-        self._local = smooth(change.square(), (2.0, 2.0, 2.0)).clamp_min(0)
+        self.change, self._largest = theta[1:] - theta[:-1], largest
+        self._local = smooth(self.coarse(self.change).square(), (2.0, 2.0, 2.0)).clamp_min(0)
         self._floor = max(noise, ROUNDING * largest)
         self.deviation = self._deviation(0.0)
         """Standard deviation of the residual."""
@@ -87,7 +105,7 @@ class Transport:
         minus its variance; what the velocity does not explain yet has the same sign in both.
         """
         covariance = float((residual[1:] * residual[:-1]).sum()) / max(len(residual) - 1, 1)
-        size = float(self._local.sum()) / len(self._local)
+        size = max(float(self._local.sum()) / len(self._local), 1e-30)
         noise = math.sqrt(max(0.0, -2 * covariance) / size)
         self.deviation = self._deviation(noise)
         return noise
@@ -107,16 +125,45 @@ class Transport:
         ----------
         splines : coefficients of the velocity at the instants, mm/s
         """
+        after, before, inside = self._ends(splines)
+        values = fixed_splines([*self.fields[1:], *self.fields[:-1]], [*after, *before])
+        residuals, count = [], len(after)
+        for k, (place, gain) in enumerate(zip(self.places, self.gains, strict=True)):
+            residual = torch.zeros(self.grid.shape).reshape(-1)
+            change = (values[k] - values[count + k] - gain) * inside[k]
+            residuals.append(residual.index_put((place,), change).reshape(self.grid.shape))
+        return self.coarse(torch.stack(residuals))
+
+    def paths(self, splines: Float[Tensor, "t 3 zp yp xp"]) -> list[Path]:
+        """Return the paths of every interval, of velocities as for `residual`."""
+        lower, spacing = torch.tensor(self.grid.box.lower), torch.tensor(self.grid.spacing)
+        paths = []
+        for place, after, before, inside in zip(self.places, *self._ends(splines), strict=True):
+            start, end = ((points[inside] - lower) / spacing + 1.5 for points in (before, after))
+            paths.append(Path(place[inside], inside, start.contiguous(), end.contiguous()))
+        return paths
+
+    def unresolved(self, share: float, least: float) -> Float[Tensor, "t z y x"]:
+        """Return a standard deviation of the residual on single voxels, of every interval.
+
+        Parameters
+        ----------
+        share : of the local change of theta
+        least : of the largest theta
+        """
+        local = smooth(self.change.square(), (2.0, 2.0, 2.0)).clamp_min(0)
+        return (share**2 * local + (least * self._largest) ** 2).sqrt()
+
+    def _ends(self, splines: Tensor) -> tuple[list[Tensor], list[Tensor], list[Tensor]]:
+        """Points of each interval half of it later and earlier, mm, and whether both are in the box."""
         velocity = along_axes(0.5 * (splines[1:] + splines[:-1]), self._up)
         lower, upper = (torch.tensor(corner) for corner in (self.grid.box.lower, self.grid.box.upper))
-        residuals = []
-        for k, (u, place, points, gain) in enumerate(
-            zip(velocity.unbind(), self.places, self.points, self.gains, strict=True)
-        ):
-            step = 0.5 * self.intervals[k] * u.reshape(3, -1)[:, place].T
-            after, before = points + step, points - step
-            inside = ((after > lower) & (after < upper) & (before > lower) & (before < upper)).all(dim=1)
-            change = fixed_spline(self.fields[k + 1], after) - fixed_spline(self.fields[k], before)
-            residual = torch.zeros(self.grid.shape).reshape(-1)
-            residuals.append(residual.index_put((place,), (change - gain) * inside).reshape(self.grid.shape))
-        return self.coarse(torch.stack(residuals))
+        halves = 0.5 * self.intervals
+        steps = [h * u.reshape(3, -1)[:, at].T for h, u, at in zip(halves, velocity.unbind(), self.places, strict=True)]
+        after = [points + step for points, step in zip(self.points, steps, strict=True)]
+        before = [points - step for points, step in zip(self.points, steps, strict=True)]
+        inside = [
+            ((a > lower) & (a < upper) & (b > lower) & (b < upper)).all(dim=1)
+            for a, b in zip(after, before, strict=True)
+        ]
+        return after, before, inside

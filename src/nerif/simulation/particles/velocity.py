@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerif.common.conventions import InputError
+from nerif.common.files import atomic
+from nerif.data.velocity_sequence import COMPONENTS, VelocitySequence
 from nerif.data.volume import Volume
+from nerif.geometry import Box, Grid
 from nerif.imaging.displacement.correlation import correlate
 
-__all__ = ["Velocity", "velocity_between"]
+__all__ = ["Velocity", "velocity_between", "write_velocities"]
 
 
 @dataclass(frozen=True)
@@ -34,6 +40,19 @@ class Velocity:
     def values(self) -> Float[Tensor, "z y x 3"]:
         """Velocity along x, y, z, mm/s; NaN where not valid."""
         return self.displacement / self.seconds
+
+    @property
+    def grid(self) -> Grid:
+        """Voxels about the nodes."""
+        nz, ny, nx = self.points.shape[:3]
+        if min(nz, ny, nx) < 2:
+            raise InputError(
+                f"expected two nodes or more along each axis, got {(nz, ny, nx)} (z, y, x)", field="window"
+            )
+        first, last = self.points[0, 0, 0].double(), self.points[-1, -1, -1].double()
+        half = 0.5 * (last - first) / torch.tensor([nx - 1.0, ny - 1.0, nz - 1.0], dtype=torch.float64)
+        lower, upper = (first - half).tolist(), (last + half).tolist()
+        return Grid(Box(tuple(lower), tuple(upper)), (nz, ny, nx))
 
     @property
     def valid(self) -> Bool[Tensor, "z y x"]:
@@ -75,3 +94,32 @@ def velocity_between(first: Volume, second: Volume, seconds: float, window: int 
     lower = torch.tensor(grid.box.lower, dtype=torch.float64)
     points = lower + (torch.stack(axes[::-1], dim=-1) + 0.5) * spacing
     return Velocity(points, movement * spacing, float(seconds))
+
+
+def write_velocities(
+    path: str | os.PathLike[str], velocities: Sequence[Velocity], times: Sequence[float], force: bool = False
+) -> VelocitySequence:
+    """Write velocities over time to a store (.zarr), which movies, exports and the app show.
+
+    Parameters
+    ----------
+    velocities : on the same nodes
+    times : of each, s
+    force : overwrite `path`
+    """
+    path = Path(path)
+    if path.exists() and not force:
+        raise InputError("exists already and was left as it is; give another path, or force", field=path)
+    if len(velocities) != len(times) or not times:
+        raise InputError(
+            f"expected as many instants as velocities, got {len(times)} and {len(velocities)}", field="times"
+        )
+    grid = velocities[0].grid
+    if any(v.points.shape != velocities[0].points.shape or v.grid != grid for v in velocities):
+        raise InputError("expected the same nodes at all instants, got others", field="velocities")
+    with atomic(path) as part:
+        store = VelocitySequence.begin(part, times, grid, (), {"source": "window correlation of particles"})
+        for k, velocity in enumerate(velocities):
+            vectors = 1e-3 * velocity.values.movedim(-1, 0)
+            store.write_frame(k, dict(zip(COMPONENTS, vectors, strict=True)))
+    return VelocitySequence(path)

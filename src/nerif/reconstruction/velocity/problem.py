@@ -1,0 +1,195 @@
+"""The velocity of a film on one grid: controls of the vorticity to flow, residual and objective, and its minimum."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nerif.geometry import Grid
+from nerif.reconstruction.velocity.boussinesq import Boussinesq
+from nerif.reconstruction.velocity.flow import Flow
+from nerif.reconstruction.velocity.periodic_box import PeriodicBox
+from nerif.reconstruction.velocity.prior import VorticityPrior
+from nerif.reconstruction.velocity.resampling import along_axes, averages, periodic_averages, periodic_splines
+from nerif.reconstruction.velocity.transport import Transport
+
+if TYPE_CHECKING:
+    from nerif.reconstruction.velocity.assimilation import VelocityFit
+
+__all__ = ["Problem", "Sample", "minimise", "resampled"]
+
+HISTORY = 60  # steps that L-BFGS remembers
+ENOUGH = 0.7  # rms of residual / sigma at which a stage ends
+GAINS = 2.0  # vorticity, relative to that of a flow which changes the density at the rate in the film
+
+
+@dataclass(frozen=True)
+class Sample:
+    """Noise of residual / sigma, and controls: both white."""
+
+    residual: Float[Tensor, "k z y x"]
+    controls: Float[Tensor, "t 3 zp yp xp"]
+
+
+class _End(Exception):
+    """A limit is reached."""
+
+
+class Problem:
+    """The fit on one grid."""
+
+    def __init__(self, settings: VelocityFit, theta: Tensor, grid: Grid, times: Sequence[float], coarse: Grid) -> None:
+        self.settings = settings
+        noise = settings.density_noise or noise_of(theta, grid, coarse)
+        self.box = box = PeriodicBox(coarse)
+        self.transport = Transport(theta, grid, times, settings.diffusivity, box, noise)
+        average = self.transport.coarse(theta)
+        buoyant = settings.physics == "boussinesq"
+        gravity = settings.gravity if buoyant else (0.0, 0.0, 0.0)
+        self.equations = Boussinesq(box, settings.viscosity, gravity)
+        rate = (theta[1:] - theta[:-1]).square().mean().sqrt() / float(self.transport.intervals.mean())
+        slope = torch.stack(torch.gradient(theta, spacing=grid.spacing[::-1], dim=(1, 2, 3))).square().sum(dim=0)
+        speed = float(rate / slope.mean().sqrt())
+        steepness = float(slope.max().sqrt() / theta.abs().max())
+        forcing = settings.forcing if buoyant else 0.5
+        amplitude = GAINS * speed * steepness
+        self.prior = VorticityPrior(box, average, amplitude, forcing, settings.correlation, gravity)
+        self.extended = box.extended(average)
+
+    def spectra(self, controls: Tensor) -> list[Tensor]:
+        """Return the spectra of the velocity at all instants."""
+        vorticity = self.prior.vorticity(controls).unbind()  # unbound, derivatives of slices stay small
+        start, *changes = (self.box.velocity(w) for w in vorticity)
+        return self.equations.solve(start, self.extended, self.transport.intervals.tolist(), changes)
+
+    @torch.no_grad()
+    def weigh(self, controls: Tensor) -> None:
+        """Set the standard deviation of the residual by the noise that it shows."""
+        residual = self.residual(self.spectra(controls)) * self.transport.deviation
+        self.transport.weigh(residual)
+
+    def residual(self, velocities: list[Tensor]) -> Tensor:
+        """Return residual / sigma of every interval."""
+        return self.transport.residual(self.splines(velocities)) / self.transport.deviation
+
+    def splines(self, velocities: list[Tensor]) -> Tensor:
+        """Return the coefficients of velocities at all instants."""
+        return torch.stack([self.box.spline(v) for v in velocities])
+
+    def loss(self, controls: Tensor, noise: Sample | None = None) -> tuple[Tensor, float]:
+        """Return the objective, and the rms of residual / sigma where much of the scalar is.
+
+        Parameters
+        ----------
+        noise : added to residual / sigma and to the controls expected a priori
+        """
+        residual = self.residual(self.spectra(controls))
+        misfit = float(residual.detach()[self.transport.core].square().mean().sqrt())
+        if noise is not None:
+            residual, controls = residual - noise.residual, controls - noise.controls
+        return 0.5 * residual.square().sum() + 0.5 * controls.square().sum(), misfit
+
+    def sample(self, generator: torch.Generator) -> Sample:
+        """Return a sample of the noise of the residual, and of the controls a priori."""
+        residual = torch.randn(self.transport.deviation.shape, generator=generator)
+        return Sample(residual, torch.randn(len(residual) + 1, 3, *self.box.shape, generator=generator))
+
+    @torch.no_grad()
+    def flow(self, controls: Tensor) -> Flow:
+        """Return the flow of controls, on the grid of the velocity."""
+        box, intervals = self.box, self.transport.intervals[:, None, None, None]
+        spectra = self.spectra(controls)
+        residual = self.residual(spectra)
+        misfit = float(residual[self.transport.core].square().mean().sqrt())
+        pressure = momentum = None
+        if self.settings.physics == "boussinesq":
+            vorticity = self.prior.vorticity(controls)
+            change = torch.stack([box.inside(box.values(box.velocity(w))) for w in vorticity[1:]])
+            momentum = change / intervals[:, None]
+            pressure = self.pressure(spectra)
+        region = self.transport.region
+        determined = torch.cat([region[:1], region[1:] | region[:-1], region[-1:]])
+        return Flow(
+            box.grid, torch.stack([box.inside(box.values(u)) for u in spectra]), pressure,
+            residual * self.transport.deviation / intervals, momentum, determined, misfit,
+        )  # fmt: skip
+
+    def pressure(self, spectra: list[Tensor]) -> Tensor:
+        """Return the pressure at the instants, mm^2/s^2, of mean 0 in the box."""
+        pressures = [self.equations.pressure(u, theta) for u, theta in zip(spectra, self.extended, strict=True)]
+        inside = self.box.inside(torch.stack(pressures))
+        return inside - inside.mean(dim=(1, 2, 3), keepdim=True)
+
+
+def minimise(
+    problem: Problem, controls: Tensor, max_iterations: int, before: int, limit: float,
+    report: Callable[[float, Tensor, int], float], noise: Sample | None = None,
+) -> tuple[Tensor, int]:  # fmt: skip
+    """Return the best controls, and the number of evaluations, until a limit or a residual of the size of sigma.
+
+    Parameters
+    ----------
+    before : evaluations so far
+    limit : of the figure that report returns
+    report : called with the misfit, the best controls and the number of evaluations
+    """
+    prior = problem.prior
+    x = prior.variables(controls).requires_grad_()
+    optimiser = torch.optim.LBFGS(
+        [x], max_iter=max_iterations, max_eval=10 * max_iterations, history_size=HISTORY,
+        tolerance_grad=0, tolerance_change=0, line_search_fn="strong_wolfe",
+    )  # fmt: skip
+    best, lowest, done = controls, math.inf, before
+
+    def closure() -> Tensor:
+        nonlocal best, lowest, done
+        optimiser.zero_grad()
+        z = prior.controls(x)
+        loss, misfit = problem.loss(z, noise)
+        loss.backward()
+        done += 1
+        if loss.item() < lowest:
+            best, lowest = z.detach(), loss.item()
+        if report(misfit, best, done) > limit or (noise is None and misfit < ENOUGH):
+            raise _End
+        return loss
+
+    with suppress(_End):
+        optimiser.step(closure)
+    return best, done
+
+
+def resampled(
+    controls: Float[Tensor, "t 3 z y x"], before: PeriodicBox, after: PeriodicBox
+) -> Float[Tensor, "t 3 z2 y2 x2"]:
+    """Return controls on another grid: splines on a finer one, averages on a coarser one.
+
+    Their amplitude is that of white noise with the same spectral density.
+    """
+    scale = math.prod(after.spacing) / math.prod(before.spacing)
+    coarser, matrices = scale > 1, []
+    for axis, count in enumerate(before.shape):
+        ratio = after.spacing[axis] / before.spacing[axis]
+        nodes = torch.arange(float(after.shape[axis])) - after.first[axis] + 0.5
+        positions = nodes * ratio - 0.5 + before.first[axis]
+        if coarser:
+            matrices.append(periodic_averages(positions, count, max(0.5, 0.5 * ratio)))
+        else:
+            matrices.append(periodic_splines(positions, count))
+    values = controls if coarser else before.spline(before.spectrum(controls))
+    return along_axes(values, matrices) * math.sqrt(scale)
+
+
+def noise_of(theta: Float[Tensor, "t z y x"], grid: Grid, coarse: Grid) -> float:
+    """Return the standard deviation of a film's averages where the fluid is ambient: where the scalar is smallest."""
+    average = along_axes(theta, averages(grid, coarse))
+    strength = average.abs().amax(dim=0)
+    calm = strength <= strength.quantile(0.5)
+    return float(average[:, calm].square().mean().sqrt())
