@@ -109,7 +109,6 @@ class VelocityFit:
     """Change of vorticity per interval that the equations do not explain, relative to its largest value."""
     correlation: Positive = 20.0
     """Wavelength below which the vorticity is expected to be smaller, mm."""
-
     samples: Annotated[int, Ge(0)] = 6
     """Samples of the flow, from which standard deviations are computed (0: none)."""
     sample_iterations: Count = 40
@@ -178,9 +177,7 @@ class VelocityFit:
         flow = problem.flow(_controls(state))
         deviations = None
         if self.samples:
-            coarse = Problem(
-                self, theta if state.theta is None else state.theta, grid, times, self._grid(grid, SAMPLED)
-            )
+            coarse = Problem(self, density, grid, times, self._grid(grid, SAMPLED))
             around = resampled(_controls(state), problem.box, coarse.box)
             deviations = deviations_of(
                 coarse, around, self.samples, self.sample_iterations,

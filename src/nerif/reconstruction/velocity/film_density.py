@@ -22,7 +22,7 @@ from nerif.geometry import Grid
 from nerif.reconstruction.projector import Projector
 from nerif.reconstruction.velocity.interpolation import periodic_spline
 from nerif.reconstruction.velocity.periodic_box import PeriodicBox
-from nerif.reconstruction.velocity.resampling import smooth
+from nerif.reconstruction.velocity.resampling import smooth, squared_slope
 from nerif.reconstruction.velocity.transport import Path, Transport
 
 __all__ = ["FilmDensity"]
@@ -56,8 +56,7 @@ class FilmDensity:
         self.start = torch.stack([p.coefficients(volume) for p, volume in zip(projectors, values, strict=True)])
         self.box = PeriodicBox(grid, 0.0)
         self.response = self.box.low_pass(CORRELATION * max(grid.spacing))
-        slopes = torch.stack(torch.gradient(values, dim=(1, 2, 3))).square().sum(dim=0)
-        slope = smooth(slopes, (2.0, 2.0, 2.0)).clamp_min(0).sqrt()
+        slope = smooth(squared_slope(values, (1.0, 1.0, 1.0)), (2.0, 2.0, 2.0)).clamp_min(0).sqrt()
         self.amplitude = slope + FLOOR * slope.max()
         self.data = [torch.nan_to_num(projector.data) for projector in projectors]
         residuals = [

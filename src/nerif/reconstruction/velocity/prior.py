@@ -18,7 +18,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerif.reconstruction.velocity.periodic_box import PeriodicBox
-from nerif.reconstruction.velocity.resampling import smooth
+from nerif.reconstruction.velocity.resampling import smooth, squared_slope
 
 __all__ = ["VorticityPrior"]
 
@@ -46,8 +46,7 @@ class VorticityPrior:
     ) -> None:  # fmt: skip
         self.box = box
         self.response = box.low_pass(correlation)
-        slopes = torch.stack(torch.gradient(theta, spacing=box.spacing, dim=(1, 2, 3))).square().sum(dim=0)
-        slope = smooth(slopes, [0.6 for _ in box.spacing]).sqrt()
+        slope = smooth(squared_slope(theta, box.spacing), [0.6 for _ in box.spacing]).sqrt()
         relative = box.extended(slope / slope.max().clamp_min(1e-30)).clamp_min(FLOOR)
         down = torch.tensor(gravity)
         direction = down / down.norm().clamp_min(1e-30)

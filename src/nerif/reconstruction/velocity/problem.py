@@ -17,7 +17,13 @@ from nerif.reconstruction.velocity.boussinesq import Boussinesq
 from nerif.reconstruction.velocity.flow import Flow
 from nerif.reconstruction.velocity.periodic_box import PeriodicBox
 from nerif.reconstruction.velocity.prior import VorticityPrior
-from nerif.reconstruction.velocity.resampling import along_axes, averages, periodic_averages, periodic_splines
+from nerif.reconstruction.velocity.resampling import (
+    along_axes,
+    averages,
+    periodic_averages,
+    periodic_splines,
+    squared_slope,
+)
 from nerif.reconstruction.velocity.transport import Transport
 
 if TYPE_CHECKING:
@@ -27,6 +33,7 @@ __all__ = ["Problem", "Sample", "minimise", "resampled"]
 
 HISTORY = 60  # steps that L-BFGS remembers
 ENOUGH = 0.7  # rms of residual / sigma at which a stage ends
+FREE_FORCING = 0.5  # change of vorticity per interval, relative to its largest value, without an equation of momentum
 GAINS = 2.0  # vorticity, relative to that of a flow which changes the density at the rate in the film
 
 
@@ -55,10 +62,10 @@ class Problem:
         gravity = settings.gravity if buoyant else (0.0, 0.0, 0.0)
         self.equations = Boussinesq(box, settings.viscosity, gravity)
         rate = (theta[1:] - theta[:-1]).square().mean().sqrt() / float(self.transport.intervals.mean())
-        slope = torch.stack(torch.gradient(theta, spacing=grid.spacing[::-1], dim=(1, 2, 3))).square().sum(dim=0)
+        slope = squared_slope(theta, grid.spacing[::-1])
         speed = float(rate / slope.mean().sqrt())
         steepness = float(slope.max().sqrt() / theta.abs().max())
-        forcing = settings.forcing if buoyant else 0.5
+        forcing = settings.forcing if buoyant else FREE_FORCING
         amplitude = GAINS * speed * steepness
         self.prior = VorticityPrior(box, average, amplitude, forcing, settings.correlation, gravity)
         self.extended = box.extended(average)

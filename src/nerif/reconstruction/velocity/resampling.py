@@ -11,7 +11,16 @@ from torch import Tensor
 from nerif.fields.grid import spline_weights
 from nerif.geometry import Grid
 
-__all__ = ["along_axes", "averages", "interpolations", "laplacian", "periodic_averages", "periodic_splines", "smooth"]
+__all__ = [
+    "along_axes",
+    "averages",
+    "interpolations",
+    "laplacian",
+    "periodic_averages",
+    "periodic_splines",
+    "smooth",
+    "squared_slope",
+]
 
 NARROWEST = 1.2  # standard deviation of an average, voxels: finer waves of a density are below the resolution of a film
 
@@ -70,6 +79,16 @@ def _gaussian(n: int, m: int, deviation: float) -> Float[Tensor, "m n"]:
     centre = (torch.arange(float(m)) + 0.5) * n / m - 0.5
     weights = torch.exp(-0.5 * ((torch.arange(float(n)) - centre[:, None]) / deviation) ** 2)
     return weights / weights.sum(dim=1, keepdim=True)
+
+
+def squared_slope(values: Float[Tensor, "t z y x"], spacing: Sequence[float]) -> Float[Tensor, "t z y x"]:
+    """Return the square of the gradient's length by central differences.
+
+    Parameters
+    ----------
+    spacing : along z, y, x
+    """
+    return torch.stack(torch.gradient(values, spacing=list(spacing), dim=(1, 2, 3))).square().sum(dim=0)
 
 
 def laplacian(values: Float[Tensor, "*c z y x"], spacing: Sequence[float]) -> Float[Tensor, "*c z y x"]:
