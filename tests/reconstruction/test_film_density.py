@@ -49,7 +49,7 @@ def improved(film: torch.Tensor, rise: float) -> torch.Tensor:
     box = PeriodicBox(GRID)
     velocity = torch.zeros(len(TIMES), 3, *box.shape)
     velocity[:, 2] = rise
-    transport = Transport(film, GRID, TIMES, 0.0, box)
+    transport = Transport(film, GRID, TIMES, torch.zeros_like(film), box)
     splines = box.spline(box.spectrum(velocity))
     return FilmDensity(film, GRID, projectors(), N_AMBIENT)(transport, splines)
 
@@ -74,7 +74,11 @@ def test_iterations_reduce_the_residual_of_the_displacements():
     splines = torch.zeros(len(TIMES), 3, *box.shape)
     splines[:, 2] = RISE
     density = FilmDensity(film, GRID, projectors(), N_AMBIENT, iterations=12)
-    density(Transport(film, GRID, TIMES, 0.0, box), splines, lambda _, misfit: residuals.append(misfit) or False)
+    density(
+        Transport(film, GRID, TIMES, torch.zeros_like(film), box),
+        splines,
+        lambda _, misfit: residuals.append(misfit) or False,
+    )
     assert len(residuals) == 12
     assert residuals[-1] < residuals[0]
     assert residuals[-1] == pytest.approx(1.0, abs=0.1)

@@ -66,7 +66,7 @@ def test_a_beltrami_flow_decays_by_viscosity_alone(steps: int):
         torch.sin(z) + 0.7 * torch.cos(y), 0.4 * torch.sin(x) + torch.cos(z), 0.7 * torch.sin(y) + 0.4 * torch.cos(x),
     ])  # fmt: skip
     viscosity, seconds = 30.0, 0.1
-    equations = Boussinesq(box, viscosity, (0.0, 0.0, -9810.0))
+    equations = Boussinesq(box, viscosity, 0.0, (0.0, 0.0, -9810.0))
     calm = torch.zeros(GRID.shape)
     velocity = box.spectrum(start)
     velocity = equations.solve(velocity, calm.expand(steps + 1, -1, -1, -1), [seconds / steps] * steps)[-1]
@@ -79,7 +79,7 @@ def test_buoyancy_accelerates_light_fluid_upwards():
     # theta = cos kx at rest: w = g cos kx (1 - exp(-nu k^2 t)) / (nu k^2), without pressure or advection
     box = PeriodicBox(GRID, margin=0.0)
     theta = 0.01 * torch.cos(WAVE * axes_of(GRID)[0])
-    equations, seconds = Boussinesq(box, 30.0, (0.0, 0.0, -9810.0)), 0.002
+    equations, seconds = Boussinesq(box, 30.0, 0.0, (0.0, 0.0, -9810.0)), 0.002
     velocity = torch.zeros_like(box.spectrum(torch.zeros(3, *GRID.shape)))
     velocity = equations.solve(velocity, theta.expand(21, -1, -1, -1), [seconds] * 20)[-1]
     rate = 30.0 * WAVE**2
@@ -100,7 +100,7 @@ def test_vortices_move_with_the_mean_flow():
         return 20.0 * torch.stack([-dz, torch.zeros_like(dx), dx])
 
     mean = torch.tensor([200.0, 0.0, 0.0])[:, None, None, None]
-    equations, velocity = Boussinesq(box, 1e-6, (0.0, 0.0, 0.0)), box.spectrum(vortex(0.0) + mean)
+    equations, velocity = Boussinesq(box, 1e-6, 0.0, (0.0, 0.0, 0.0)), box.spectrum(vortex(0.0) + mean)
     velocity = equations.solve(velocity, torch.zeros(21, *GRID.shape), [0.002] * 20)[-1]
     moved = box.values(velocity) - mean
     exact, start = vortex(8.0), vortex(0.0)  # mm, after 40 ms
@@ -130,7 +130,7 @@ def test_transport_leaves_no_residual_of_a_puff_that_moves_and_spreads(velocity:
 
     film = torch.stack([puff(t) for t in times])
     box = PeriodicBox(Grid(GRID.box, (16, 16, 16)))
-    transport = Transport(film, GRID, times, kappa, box)
+    transport = Transport(film, GRID, times, Boussinesq(box, 0.0, kappa, (0.0, 0.0, 0.0)).rate(film, GRID), box)
     uniform = torch.tensor(velocity)[None, :, None, None, None].expand(3, 3, *box.shape)
     change = transport.coarse(film[1:] - film[:-1])
     moving = float(torch.tensor(velocity).norm()) * interval > 1

@@ -22,8 +22,7 @@ from nerif.data.measurement_sequence import MeasurementSequence, check_store
 from nerif.data.velocity_sequence import COMPONENTS, VelocitySequence
 from nerif.data.volume import INDEX
 from nerif.data.volume_sequence import FIELDS, VolumeSequence
-from nerif.fields.grid import VoxelField
-from nerif.geometry import Grid
+from nerif.geometry.symmetry import Symmetry
 from nerif.physics.gas_optics import density_from_index, gladstone_dale
 from nerif.physics.quantities import GasSettings
 from nerif.reconstruction.files import digest, read_tensors, write_tensors
@@ -31,6 +30,7 @@ from nerif.reconstruction.projector import Projector
 from nerif.reconstruction.velocity.assimilation import Iterate, State, VelocityFit
 from nerif.reconstruction.velocity.film_density import FilmDensity
 from nerif.reconstruction.velocity.flow import Flow
+from nerif.reconstruction.velocity.sections import Space, section_of
 
 __all__ = ["densities", "velocity_of_film"]
 
@@ -81,6 +81,9 @@ def velocity_of_film(
     theta, times = densities(store, slice(first, last)), store.times[first:last]
     checkpoint = out.with_suffix(".checkpoint.safetensors")
     settings.check(theta, store.grid, times)
+    symmetry = store.attributes.get("symmetry")
+    section = section_of(store.grid, Symmetry.from_entries(symmetry) if symmetry else None)
+    method = section.settings(settings)
     improvement = _improvement(store, theta, slice(first, last), measurement, density, say)
     displacements = None if improvement is None else improvement.inputs
     place = [store.grid.box.lower, store.grid.box.upper, store.n_ambient]
@@ -103,8 +106,8 @@ def velocity_of_film(
         return f"the state is kept in {checkpoint}; run the same command again to continue"
 
     with if_interrupted(stopped):
-        flow = settings(theta, store.grid, times, update, state, improvement)
-    result = _write(out, store, theta, times, settings, flow)
+        flow = method(section.of(theta), section.grid, times, update, state, improvement, section.box)
+    result = _write(out, store, theta, times, settings, flow, section)
     checkpoint.unlink(missing_ok=True)
     determined = float(flow.determined.float().mean())
     say(
@@ -208,8 +211,9 @@ def _resumed(checkpoint: Path, inputs: str, say: Callable[[str], None]) -> State
 
 
 def _write(
-    out: Path, film: VolumeSequence, theta: Tensor, times: Sequence[float], settings: VelocityFit, flow: Flow
-) -> VelocitySequence:
+    out: Path, film: VolumeSequence, theta: Tensor, times: Sequence[float], settings: VelocityFit, flow: Flow,
+    section: Space,
+) -> VelocitySequence:  # fmt: skip
     """Write a flow on the grid of the film, in SI units."""
     gas = GasSettings(**film.attributes["gas"]) if "gas" in film.attributes else GasSettings()
     constant = gladstone_dale(gas.composition, gas.wavelength_nm)
@@ -230,33 +234,28 @@ def _write(
         "settings": asdict(settings), "misfit": flow.misfit, "iterations": flow.iterations,
         "seconds": flow.seconds,
     }  # fmt: skip
-    resize = torch.nn.functional.interpolate
-    determined = resize(flow.determined.float()[:, None], film.grid.shape, mode="nearest-exact")
     residual = _at_instants(flow.transport)
     momentum = None if flow.momentum is None else _at_instants(flow.momentum.norm(dim=1))
-
-    def fine(values: Tensor, scale: float, k: int, grid: Grid = flow.grid) -> Tensor:
-        spline = VoxelField.through(scale * values, grid)
-        return spline.sample(film.grid).masked_fill(determined[k, 0] < 0.5, math.nan)
-
     theta = theta if flow.theta is None else flow.theta
     check_store(out, FIELDS)
     with atomic(out) as part:
         store = VelocitySequence.begin(part, times, film.grid, more, about)
         for k in range(len(times)):
-            arrays = dict(zip(COMPONENTS, (fine(component, 1e-3, k) for component in flow.velocity[k]), strict=True))
-            arrays["density"] = density * (1 - theta[k])
-            arrays["transport_residual"] = fine(residual[k], 1.0, k)
+            velocity = section.vector(1e-3 * flow.velocity[k], flow.grid)
+            arrays = dict(zip(COMPONENTS, velocity, strict=True))
+            arrays["transport_residual"] = section.scalar(residual[k], flow.grid)
             if flow.pressure is not None and momentum is not None:
-                arrays["pressure"] = fine(flow.pressure[k], density * 1e-6, k)
-                arrays["momentum_residual"] = fine(momentum[k], 1e-3, k)
+                arrays["pressure"] = section.scalar(density * 1e-6 * flow.pressure[k], flow.grid)
+                arrays["momentum_residual"] = section.scalar(1e-3 * momentum[k], flow.grid)
             if deviations is not None:
-                for name, values in zip(COMPONENTS, deviations.velocity[k], strict=True):
-                    arrays[f"{name}_std"] = fine(values, 1e-3, k, deviations.grid).clamp_min(0)
+                parts = section.deviation(1e-3 * deviations.velocity[k], deviations.grid)
+                arrays |= {f"{name}_std": part.clamp_min(0) for name, part in zip(COMPONENTS, parts, strict=True)}
                 if deviations.pressure is not None:
-                    values = fine(deviations.pressure[k], density * 1e-6, k, deviations.grid)
-                    arrays["pressure_std"] = values.clamp_min(0)
-            store.write_frame(k, arrays)
+                    pressure = section.scalar(density * 1e-6 * deviations.pressure[k], deviations.grid)
+                    arrays["pressure_std"] = pressure.clamp_min(0)
+            unknown = ~section.mask(flow.determined[k], flow.grid)
+            arrays = {name: values.masked_fill(unknown, math.nan) for name, values in arrays.items()}
+            store.write_frame(k, arrays | {"density": density * (1 - theta[k])})
     return VelocitySequence(out)
 
 

@@ -29,14 +29,16 @@ from nerif.common.settings import Count, Positive, check_settings
 from nerif.geometry import Grid
 from nerif.reconstruction.velocity.deviations import deviations_of
 from nerif.reconstruction.velocity.flow import Flow
+from nerif.reconstruction.velocity.low_mach import LARGEST
+from nerif.reconstruction.velocity.periodic_box import PeriodicBox
 from nerif.reconstruction.velocity.problem import Problem, minimise, resampled
 from nerif.reconstruction.velocity.transport import Transport
 
 __all__ = ["PHYSICS", "Improvement", "Iterate", "State", "VelocityFit"]
 
-PHYSICS = ("boussinesq", "transport")
-LARGEST_DENSITY_CHANGE = 0.3  # of the Boussinesq equations
-STAGES = ((0.67, 0.1), (1.0, 0.8))
+PHYSICS = ("boussinesq", "low-mach", "transport")
+LARGEST_DENSITY_CHANGE = {"boussinesq": 0.3, "low-mach": LARGEST}
+STAGES = ((0.67, 0.1), (1.0, 0.45), (1.0, 0.8))
 """Voxels along an edge, relative to the finest grid, and the share of the time at which the stage ends."""
 STAGES_WITH_DENSITY = ((0.67, 0.08), (0.67, 0.22), (1.0, 0.48), (1.0, 0.8))
 """The same where the density is improved between stages."""
@@ -90,7 +92,7 @@ class VelocityFit:
     """Settings of the velocity of a film; called with densities, returns the Flow."""
 
     physics: Literal[*PHYSICS] = "boussinesq"  # type: ignore[valid-type]
-    """Equations: boussinesq (buoyant flow of nearly uniform density), or transport (no equation of momentum)."""
+    """Equations: boussinesq (nearly uniform density), low-mach (hot gas), or transport (no equation of momentum)."""
     viscosity: Positive = 15.0
     """Kinematic viscosity, mm^2/s."""
     diffusivity: Positive = 20.0
@@ -120,7 +122,7 @@ class VelocityFit:
     def __call__(
         self, theta: Float[Tensor, "t z y x"], grid: Grid, times: Sequence[float],
         on_iterate: Callable[[Iterate, State], None] = lambda iterate, state: None, resume: State | None = None,
-        improve: Improvement | None = None,
+        improve: Improvement | None = None, box_of: Callable[[Grid], PeriodicBox] = PeriodicBox,
     ) -> Flow:  # fmt: skip
         """Return velocity and pressure of a film.
 
@@ -132,6 +134,7 @@ class VelocityFit:
         on_iterate : called after every evaluation, with the best state so far
         resume : state of an earlier run with the same input and settings
         improve : returns better densities, given the velocity; called between stages
+        box_of : returns the periodic box of a grid, in which the equations are solved
         """
         theta = theta.float()
         self.check(theta, grid, times)
@@ -160,7 +163,7 @@ class VelocityFit:
                     splines = problem.splines(problem.spectra(_controls(state)))
                 state = replace(state, theta=improve(problem.transport, splines, improved))
             before, density = problem, theta if state.theta is None else state.theta
-            problem = Problem(self, density, grid, times, self._grid(grid, share))
+            problem = Problem(self, density, grid, times, box_of(self._grid(grid, share)))
             if state.controls is None:
                 controls = torch.zeros(len(times), 3, *problem.box.shape)
             else:
@@ -177,7 +180,7 @@ class VelocityFit:
         flow = problem.flow(_controls(state))
         deviations = None
         if self.samples:
-            coarse = Problem(self, density, grid, times, self._grid(grid, SAMPLED))
+            coarse = Problem(self, density, grid, times, box_of(self._grid(grid, SAMPLED)))
             around = resampled(_controls(state), problem.box, coarse.box)
             deviations = deviations_of(
                 coarse, around, self.samples, self.sample_iterations,
@@ -198,7 +201,7 @@ class VelocityFit:
             raise InputError(f"expected three frames or more, got {len(times)}", field="film")
         if tuple(theta.shape) != (len(times), *grid.shape):
             raise InputError(f"expected densities of shape {(len(times), *grid.shape)}, got {tuple(theta.shape)}")
-        if min(grid.shape) < MIN_FILM_VOXELS:
+        if min(n for n in grid.shape if n > 1) < MIN_FILM_VOXELS:
             raise InputError(
                 f"expected {MIN_FILM_VOXELS} voxels or more along each edge, got {grid.shape} (z, y, x); run nerif "
                 "sequence with more --voxels", field="film",
@@ -210,19 +213,20 @@ class VelocityFit:
         largest = float(theta.abs().max())
         if not largest > 0:
             raise InputError("the density is the same everywhere, so that nothing shows the velocity", field="film")
-        if self.physics == "boussinesq" and largest > LARGEST_DENSITY_CHANGE:
+        limit = LARGEST_DENSITY_CHANGE.get(self.physics, math.inf)
+        if largest > limit:
+            remedy = "low-mach for a hot gas without heat release, or transport"
             raise InputError(
-                f"expected density changes below {LARGEST_DENSITY_CHANGE:.0%} for boussinesq, got {largest:.0%}: heat "
-                "release or a hot gas, whose expansion these equations lack; give --physics transport for an estimate",
-                field="physics",
-            )
+                f"expected density changes below {limit:.0%} for {self.physics}, got {largest:.0%}; give --physics "
+                f"{remedy if self.physics == 'boussinesq' else 'transport'} for an estimate", field="physics",
+            )  # fmt: skip
         if not float((theta[1:] - theta[:-1]).abs().max()) > 0:
             raise InputError("the density does not change in time, so that nothing shows the velocity", field="film")
 
     def _grid(self, grid: Grid, share: float) -> Grid:
         count = max(MIN_VOXELS, round(self.resolution * share))
         shape = Grid.of_resolution(grid.box, min(count, max(grid.shape))).shape
-        nz, ny, nx = (max(n, MIN_FILM_VOXELS) for n in shape)
+        nz, ny, nx = (1 if fine == 1 else max(n, MIN_FILM_VOXELS) for n, fine in zip(shape, grid.shape, strict=True))
         return Grid(grid.box, (nz, ny, nx))
 
 

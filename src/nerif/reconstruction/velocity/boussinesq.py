@@ -17,10 +17,11 @@ import torch
 from jaxtyping import Complex, Float
 from torch import Tensor
 
+from nerif.geometry import Grid
 from nerif.reconstruction.velocity.interpolation import periodic_spline
 from nerif.reconstruction.velocity.periodic_box import PeriodicBox
 
-__all__ = ["Boussinesq"]
+__all__ = ["Boussinesq", "Spectrum"]
 
 Spectrum = Complex[Tensor, "3 z y xr"]
 
@@ -32,12 +33,19 @@ class Boussinesq:
     ----------
     box : of the velocity
     viscosity : kinematic, mm^2/s
+    diffusivity : of theta, mm^2/s
     gravity : g along x, y, z, mm/s^2
     """
 
-    def __init__(self, box: PeriodicBox, viscosity: float, gravity: tuple[float, float, float]) -> None:
-        self.box, self.viscosity = box, viscosity
+    def __init__(
+        self, box: PeriodicBox, viscosity: float, diffusivity: float, gravity: tuple[float, float, float]
+    ) -> None:
+        self.box, self.viscosity, self.diffusivity = box, viscosity, diffusivity
         self.gravity = torch.tensor(gravity)[:, None, None, None]
+
+    def rate(self, theta: Float[Tensor, "t z y x"], grid: Grid) -> Float[Tensor, "t z y x"]:
+        """Return the change of theta along the path of the fluid, 1/s, on the grid of a film: kappa lap theta."""
+        return self.diffusivity * self.box.laplacian(theta, grid)
 
     def solve(
         self, start: Spectrum, theta: Float[Tensor, "t z y x"], intervals: Sequence[float],
@@ -47,46 +55,86 @@ class Boussinesq:
 
         Parameters
         ----------
-        start : at the first instant
+        start : without divergence, at the first instant
         theta : at all instants
         intervals : between them, s
         changes : of the velocity at each later instant, which the equations do not explain
         """
-        box, velocities = self.box, [start]
-        pressed = self._pressed(start, theta[0])
-        buoyancy = box.spline(box.spectrum(theta))
+        box, velocities = self.box, [start + self._expansion(theta[0])]
+        pressed = self._pressed(velocities[0], theta[0], (theta[1] - theta[0]) / intervals[0])
+        buoyancy = self._buoyancy(theta)
+        splines = box.spline(box.spectrum(buoyancy))
         for k, seconds in enumerate(intervals):
             halfway = velocities[-1]
             if k > 0:
                 halfway = halfway + 0.5 * seconds / intervals[k - 1] * (velocities[-1] - velocities[-2])
             brought = box.spline(velocities[-1] - 0.5 * seconds * pressed)
-            moved = self._from_before(halfway, torch.cat([brought, buoyancy[k, None]]), seconds)
-            force = 0.5 * (moved[3] + theta[k + 1])
+            moved = self._from_before(halfway, torch.cat([brought, splines[k, None]]), seconds)
+            force = 0.5 * (moved[3] + buoyancy[k + 1])
             pushed = box.spectrum(moved[:3] - seconds * self.gravity * force)
-            velocity = box.solenoidal(pushed)
-            pressed = (pushed - velocity) / (0.5 * seconds)
-            velocity = velocity * torch.exp(-self.viscosity * seconds * box.wave_square)
+            velocity, pressed = self._projected(pushed, theta[k + 1], seconds, pressed)
             if changes is not None:
                 velocity = velocity + changes[k]
             velocities.append(velocity)
         return velocities
 
-    def pressure(self, velocity: Spectrum, theta: Float[Tensor, "z y x"]) -> Float[Tensor, "z y x"]:
-        """Return the pressure over the reference density, mm^2/s^2, of mean 0: lap p = -div (u . grad u + theta g)."""
-        box = self.box
-        force = box.spectrum(self._force(velocity, theta))
-        return box.values((box.wave * force).sum(dim=0) * (-1j * box.inverse_square))
+    def pressures(
+        self, velocities: Sequence[Spectrum], theta: Float[Tensor, "t z y x"], intervals: Sequence[float]
+    ) -> Float[Tensor, "t z y x"]:
+        """Return the pressure over the reference density at all instants, mm^2/s^2, of mean 0.
 
-    def _pressed(self, velocity: Spectrum, theta: Float[Tensor, "z y x"]) -> Spectrum:
-        """Spectrum of the gradient of pressure."""
+        Parameters
+        ----------
+        velocities, theta : at all instants
+        intervals : between them, s
+        """
+        times = torch.tensor([0.0, *intervals]).cumsum(dim=0)
+        rates = torch.gradient(theta, spacing=(times,), dim=0)[0]
+        accelerations = [self._pressed(*of_frame) for of_frame in zip(velocities, theta, rates, strict=True)]
+        gradients = [self._gradient(a, now) for a, now in zip(accelerations, theta, strict=True)]
+        return torch.stack([self.box.values(self.box.potential(g)) for g in gradients])
+
+    def _buoyancy(self, theta: Tensor) -> Tensor:
+        """Buoyant acceleration over -g."""
+        return theta
+
+    def _expansion(self, theta: Float[Tensor, "z y x"]) -> Spectrum | float:
+        """Velocity of the fluid that expands or contracts, a gradient."""
+        return 0.0
+
+    def _pressed(self, velocity: Spectrum, theta: Float[Tensor, "z y x"], rate: Float[Tensor, "z y x"]) -> Spectrum:
+        """Spectrum of -(acceleration by pressure) at an instant.
+
+        Parameters
+        ----------
+        rate : of theta at fixed points, 1/s
+        """
         force = self.box.spectrum(self._force(velocity, theta))
         return force - self.box.solenoidal(force)
 
+    def _gradient(self, pressed: Spectrum, theta: Float[Tensor, "z y x"]) -> Spectrum:
+        """Spectrum of grad p / rho_0 of -(acceleration by pressure)."""
+        return pressed
+
+    def _projected(
+        self, pushed: Spectrum, theta: Float[Tensor, "z y x"], seconds: float, pressed: Spectrum
+    ) -> tuple[Spectrum, Spectrum]:
+        """Velocity after pressure and viscosity, and -(acceleration by pressure).
+
+        Parameters
+        ----------
+        pushed : velocity of the fluid that arrives, with all other forces
+        theta : now
+        pressed : an interval before
+        """
+        velocity = self.box.solenoidal(pushed)
+        return self.box.diffused(velocity, self.viscosity * seconds), (pushed - velocity) / (0.5 * seconds)
+
     def _force(self, velocity: Spectrum, theta: Float[Tensor, "z y x"]) -> Float[Tensor, "3 z y x"]:
-        """-u . grad u - theta g."""
+        """-u . grad u, and buoyancy."""
         box, u = self.box, self.box.values(velocity)
         advection = torch.stack([(u * box.gradient(component)).sum(dim=0) for component in velocity.unbind()])
-        return -advection - theta * self.gravity
+        return -advection - self._buoyancy(theta) * self.gravity
 
     def _from_before(
         self, halfway: Spectrum, fields: Float[Tensor, "c z y x"], seconds: float

@@ -65,9 +65,9 @@ def _around(values: Float[Tensor, "c z y x"]) -> Float[Tensor, "zl yl xl 4"]:
     nz, ny, nx = values.shape[1:]
     result = torch.zeros(nz + LAYERS, ny + LAYERS, nx + LAYERS, CHANNELS)
     result[:nz, :ny, :nx, : len(values)] = values.permute(1, 2, 3, 0)
-    result[:nz, :ny, nx:] = result[:nz, :ny, :LAYERS]
-    result[:nz, ny:] = result[:nz, :LAYERS]
-    result[nz:] = result[:LAYERS]
+    for axis, n in ((2, nx), (1, ny), (0, nz)):
+        for layer in range(LAYERS):
+            result.select(axis, n + layer).copy_(result.select(axis, layer % n))
     return result
 
 
@@ -76,7 +76,8 @@ def _folded(values: Float[Tensor, "zl yl xl 4"]) -> Float[Tensor, "4 z y x"]:
     for axis in range(3):
         n = values.shape[axis] - LAYERS
         inner = values.narrow(axis, 0, n)
-        inner.narrow(axis, 0, LAYERS).add_(values.narrow(axis, n, LAYERS))
+        for layer in range(LAYERS):
+            inner.select(axis, layer % n).add_(values.select(axis, n + layer))
         values = inner
     return values.permute(3, 0, 1, 2).contiguous()
 

@@ -10,6 +10,7 @@ from jaxtyping import Complex, Float
 from torch import Tensor
 
 from nerif.geometry import Grid
+from nerif.reconstruction.velocity.resampling import laplacian
 
 __all__ = ["PeriodicBox"]
 
@@ -29,13 +30,8 @@ class PeriodicBox:
     """
 
     def __init__(self, grid: Grid, margin: float = 0.2) -> None:
-        from scipy.fft import next_fast_len
-
         self.grid = grid
-        self.shape = grid.shape
-        if margin > 0:
-            layers = [max(MIN_LAYERS, round(margin * n)) for n in grid.shape]
-            self.shape = tuple(next_fast_len(n + 2 * m, real=True) for n, m in zip(grid.shape, layers, strict=True))
+        self.shape = tuple(self._length(n, max(MIN_LAYERS, round(margin * n)) if margin > 0 else 0) for n in grid.shape)
         self.first = tuple((m - n) // 2 for m, n in zip(self.shape, grid.shape, strict=True))
         """Voxels before the box, along z, y, x."""
         self.spacing = grid.spacing[::-1]
@@ -44,6 +40,12 @@ class PeriodicBox:
         """(3, z, y, x) wave vectors along x, y, z, 1/mm."""
         self.wave_square = self.wave.square().sum(dim=0)
         self.inverse_square = torch.where(self.wave_square > 0, 1 / self.wave_square.clamp_min(1e-30), 0.0)
+
+    def _length(self, count: int, layers: int) -> int:
+        """Voxels along an edge, with layers on each side; of a flow in a plane one remains."""
+        from scipy.fft import next_fast_len
+
+        return int(next_fast_len(count + 2 * layers, real=True)) if layers and count > 1 else count
 
     def _frequencies(self, axis: int) -> Tensor:
         frequencies = torch.fft.rfftfreq if axis == 2 else torch.fft.fftfreq
@@ -80,6 +82,14 @@ class PeriodicBox:
         divergence = (self.wave * spectrum).sum(dim=0)
         return spectrum - self.wave * (divergence * self.inverse_square)
 
+    def potential(self, spectrum: Complex[Tensor, "3 z y xr"]) -> Complex[Tensor, "z y xr"]:
+        """Return the potential of the gradient in vectors, of mean 0: lap p = div v."""
+        return (self.wave * spectrum).sum(dim=0) * (-1j * self.inverse_square)
+
+    def diffused(self, spectrum: Complex[Tensor, "3 z y xr"], amount: float) -> Complex[Tensor, "3 z y xr"]:
+        """Return vectors after diffusion: exp(amount lap) v, amount in mm^2."""
+        return spectrum * torch.exp(-amount * self.wave_square)
+
     def velocity(self, vorticity: Float[Tensor, "3 z y x"]) -> Complex[Tensor, "3 z y xr"]:
         """Return the spectrum of the velocity of divergence 0, and mean 0, with a vorticity: u = curl w / k^2."""
         w = self.spectrum(vorticity) * (1j * self.inverse_square)
@@ -89,6 +99,14 @@ class PeriodicBox:
     def gradient(self, spectrum: Complex[Tensor, "z y xr"]) -> Float[Tensor, "3 z y x"]:
         """Return the gradient of a scalar, per mm."""
         return self.values(1j * self.wave * spectrum)
+
+    def laplacian(self, values: Float[Tensor, "*c z y x"], grid: Grid) -> Float[Tensor, "*c z y x"]:
+        """Return the Laplacian of scalars on a grid of the measurement, per mm^2."""
+        return laplacian(values, grid.spacing[::-1])
+
+    def steady_noise(self, variance: Float[Tensor, "z y x"]) -> Tensor:
+        """Return the part of a film's variance of noise that does not grow with the change of density: none."""
+        return torch.zeros(())
 
     def low_pass(self, wavelength: float) -> Float[Tensor, "z y xr"]:
         """Return the response (1 + (k L / 2 pi)^2)^-1, scaled so that white fields keep their variance.

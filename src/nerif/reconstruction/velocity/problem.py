@@ -15,6 +15,7 @@ from torch import Tensor
 from nerif.geometry import Grid
 from nerif.reconstruction.velocity.boussinesq import Boussinesq
 from nerif.reconstruction.velocity.flow import Flow
+from nerif.reconstruction.velocity.low_mach import LowMach
 from nerif.reconstruction.velocity.periodic_box import PeriodicBox
 from nerif.reconstruction.velocity.prior import VorticityPrior
 from nerif.reconstruction.velocity.resampling import (
@@ -52,20 +53,22 @@ class _End(Exception):
 class Problem:
     """The fit on one grid."""
 
-    def __init__(self, settings: VelocityFit, theta: Tensor, grid: Grid, times: Sequence[float], coarse: Grid) -> None:
-        self.settings = settings
-        noise = settings.density_noise or noise_of(theta, grid, coarse)
-        self.box = box = PeriodicBox(coarse)
-        self.transport = Transport(theta, grid, times, settings.diffusivity, box, noise)
+    def __init__(
+        self, settings: VelocityFit, theta: Tensor, grid: Grid, times: Sequence[float], box: PeriodicBox
+    ) -> None:
+        self.settings, self.box = settings, box
+        noise = settings.density_noise or noise_of(theta, grid, box.grid)
+        equations = LowMach if settings.physics == "low-mach" else Boussinesq
+        forces = settings.physics != "transport"
+        gravity = settings.gravity if forces else (0.0, 0.0, 0.0)
+        self.equations = equations(box, settings.viscosity, settings.diffusivity, gravity)
+        self.transport = Transport(theta, grid, times, self.equations.rate(theta, grid), box, noise)
         average = self.transport.coarse(theta)
-        buoyant = settings.physics == "boussinesq"
-        gravity = settings.gravity if buoyant else (0.0, 0.0, 0.0)
-        self.equations = Boussinesq(box, settings.viscosity, gravity)
         rate = (theta[1:] - theta[:-1]).square().mean().sqrt() / float(self.transport.intervals.mean())
         slope = squared_slope(theta, grid.spacing[::-1])
         speed = float(rate / slope.mean().sqrt())
         steepness = float(slope.max().sqrt() / theta.abs().max())
-        forcing = settings.forcing if buoyant else FREE_FORCING
+        forcing = settings.forcing if forces else FREE_FORCING
         amplitude = GAINS * speed * steepness
         self.prior = VorticityPrior(box, average, amplitude, forcing, settings.correlation, gravity)
         self.extended = box.extended(average)
@@ -116,7 +119,7 @@ class Problem:
         residual = self.residual(spectra)
         misfit = float(residual[self.transport.core].square().mean().sqrt())
         pressure = momentum = None
-        if self.settings.physics == "boussinesq":
+        if self.settings.physics != "transport":
             vorticity = self.prior.vorticity(controls)
             change = torch.stack([box.inside(box.values(box.velocity(w))) for w in vorticity[1:]])
             momentum = change / intervals[:, None]
@@ -130,8 +133,7 @@ class Problem:
 
     def pressure(self, spectra: list[Tensor]) -> Tensor:
         """Return the pressure at the instants, mm^2/s^2, of mean 0 in the box."""
-        pressures = [self.equations.pressure(u, theta) for u, theta in zip(spectra, self.extended, strict=True)]
-        inside = self.box.inside(torch.stack(pressures))
+        inside = self.box.inside(self.equations.pressures(spectra, self.extended, self.transport.intervals.tolist()))
         return inside - inside.mean(dim=(1, 2, 3), keepdim=True)
 
 

@@ -88,7 +88,8 @@ def squared_slope(values: Float[Tensor, "t z y x"], spacing: Sequence[float]) ->
     ----------
     spacing : along z, y, x
     """
-    return torch.stack(torch.gradient(values, spacing=list(spacing), dim=(1, 2, 3))).square().sum(dim=0)
+    axes = [axis for axis in (1, 2, 3) if values.shape[axis] > 1]
+    return torch.stack(torch.gradient(values, spacing=[spacing[a - 1] for a in axes], dim=axes)).square().sum(dim=0)
 
 
 def laplacian(values: Float[Tensor, "*c z y x"], spacing: Sequence[float]) -> Float[Tensor, "*c z y x"]:

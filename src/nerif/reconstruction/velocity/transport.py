@@ -1,6 +1,6 @@
 """How well velocities explain that a scalar is carried along: the residual of its transport.
 
-    r = theta_(k+1)(x + u dt / 2) - theta_k(x - u dt / 2) - dt kappa lap theta
+    r = theta_(k+1)(x + u dt / 2) - theta_k(x - u dt / 2) - dt (Dtheta/Dt)
 
 on the voxels of the film, then averaged over those of the velocity: an equation holds for averages where waves shorter
 than a few voxels are not resolved.
@@ -21,7 +21,7 @@ from nerif.fields.grid import VoxelField
 from nerif.geometry import Grid
 from nerif.reconstruction.velocity.interpolation import fixed_splines
 from nerif.reconstruction.velocity.periodic_box import PeriodicBox
-from nerif.reconstruction.velocity.resampling import along_axes, averages, interpolations, laplacian, smooth
+from nerif.reconstruction.velocity.resampling import along_axes, averages, interpolations, smooth
 
 __all__ = ["Path", "Transport"]
 
@@ -57,13 +57,13 @@ class Transport:
     theta : scalar at the instants
     grid : its voxels
     times : s
-    diffusivity : mm^2/s
+    rate : change of theta along the path of the fluid at the instants, 1/s
     box : grid of the velocity
     noise : standard deviation of theta, averaged over voxels of the velocity
     """
 
     def __init__(
-        self, theta: Float[Tensor, "t z y x"], grid: Grid, times: Sequence[float], diffusivity: float,
+        self, theta: Float[Tensor, "t z y x"], grid: Grid, times: Sequence[float], rate: Float[Tensor, "t z y x"],
         box: PeriodicBox, noise: float = 0.0,
     ) -> None:  # fmt: skip
         self.grid, self.box = grid, box
@@ -71,8 +71,7 @@ class Transport:
         self._down = averages(grid, box.grid)
         self._up = interpolations(box.grid, grid, box.shape, box.first)
         self.fields = [VoxelField.through(volume, grid) for volume in theta]
-        curvature = laplacian(theta, grid.spacing[::-1])
-        gain = diffusivity * self.intervals[:, None, None, None] * 0.5 * (curvature[1:] + curvature[:-1])
+        gain = self.intervals[:, None, None, None] * 0.5 * (rate[1:] + rate[:-1])
         centres, largest = grid.points().reshape(-1, 3), float(theta.abs().max())
         self.places, self.points, self.gains = [], [], []
         pool = torch.nn.functional.max_pool3d
@@ -88,15 +87,15 @@ class Transport:
         self.change, self._largest = theta[1:] - theta[:-1], largest
         self._local = smooth(self.coarse(self.change).square(), (2.0, 2.0, 2.0)).clamp_min(0)
         self._floor = max(noise, ROUNDING * largest)
-        self.deviation = self._deviation(0.0)
+        self.deviation = self._deviation(0.0, torch.zeros(()))
         """Standard deviation of the residual."""
 
     def coarse(self, values: Float[Tensor, "*t z y x"]) -> Float[Tensor, "*t z2 y2 x2"]:
         """Return averages over the voxels of the velocity."""
         return along_axes(values, self._down)
 
-    def _deviation(self, noise: float) -> Tensor:
-        return (self._floor**2 + (MODEL_ERROR**2 + noise**2) * self._local).sqrt()
+    def _deviation(self, noise: float, steady: Tensor) -> Tensor:
+        return (steady.clamp_min(self._floor**2) + (MODEL_ERROR**2 + noise**2) * self._local).sqrt()
 
     def weigh(self, residual: Float[Tensor, "t z y x"]) -> float:
         """Estimate the noise of the densities from a residual, set `deviation`, and return it relative to the change.
@@ -104,10 +103,11 @@ class Transport:
         An error of one frame enters the residuals before and after it with opposite signs, so that their covariance is
         minus its variance; what the velocity does not explain yet has the same sign in both.
         """
-        covariance = float((residual[1:] * residual[:-1]).sum()) / max(len(residual) - 1, 1)
+        variance = -2 * (residual[1:] * residual[:-1]).sum(dim=0) / max(len(residual) - 1, 1)
         size = max(float(self._local.sum()) / len(self._local), 1e-30)
-        noise = math.sqrt(max(0.0, -2 * covariance) / size)
-        self.deviation = self._deviation(noise)
+        steady = self.box.steady_noise(variance)
+        noise = math.sqrt(max(0.0, float((variance - steady).sum())) / size)
+        self.deviation = self._deviation(noise, steady)
         return noise
 
     @cached_property
