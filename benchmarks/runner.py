@@ -25,6 +25,7 @@ import statistics
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 import traceback
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -322,7 +323,16 @@ def alone(name: str, case: Settings, data: Path) -> Record:
 
 def _work(name: str, case: Settings, data: Path, sender: Connection) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     sender.send(measured(name, case, data))
+
+
+def _end_with_parent() -> None:
+    """End this process with its parent, also if that is killed: nothing shall compute beside the next run."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
 
 
 def measured(name: str, case: Settings, data: Path) -> Record:

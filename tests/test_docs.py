@@ -52,6 +52,14 @@ def test_pages_of_the_api_tell_of_what_is_there(page: str) -> None:
         resolve_name(name)
 
 
+def test_every_decision_is_in_the_index():
+    decisions = ROOT / "docs" / "decisions"
+    index = (decisions / "index.md").read_text()
+    pages = sorted(p.name for p in decisions.glob("0*.md"))
+    assert pages
+    assert [name for name in pages if f"({name})" not in index] == []
+
+
 @pytest.mark.slow
 def test_site_is_whole_and_loads_nothing_from_the_web(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", "-b", "html"]

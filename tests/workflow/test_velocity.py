@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +18,7 @@ from nerif.data.volume import Volume
 from nerif.data.volume_sequence import VolumeSequence
 from nerif.data.vti import read_vti
 from nerif.geometry import Box, Grid
+from nerif.geometry.symmetry import Symmetry
 from nerif.reconstruction.velocity.assimilation import Iterate, VelocityFit
 from nerif.workflow.velocity import velocity_of_film
 from refusals import refused
@@ -132,6 +135,43 @@ def test_an_interrupted_run_continues_from_its_checkpoint(film: Path, tmp_path: 
     assert not checkpoint.exists()
     with refused(out):
         velocity_of_film(film, out, settings)
+
+
+def test_a_symmetric_film_is_solved_in_the_plane_of_its_axis(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("nerif.workflow.velocity.CHECKPOINT_INTERVAL", 0.0)
+    lean = math.radians(5.0)
+    symmetry = Symmetry.about("axis", (1.0, -1.0, 0.0), (math.sin(lean), 0.0, math.cos(lean)), 1e-3)
+    assert symmetry is not None
+    r, _, h = symmetry.reduced(GRID.points(torch.float32)).unbind(-1)
+    film = tmp_path / "film.zarr"
+    attributes = {"symmetry": asdict(symmetry)}
+    store = VolumeSequence.create(film, TIMES, GRID, ("index_excess",), N_AMBIENT, attributes)
+    for k, t in enumerate(TIMES):
+        theta = 0.1 * torch.exp(-((r / 6.0) ** 2) - ((h + 4.0 - RISE * t) / 5.0) ** 2)
+        store.write(k, [Volume.of((1 - N_AMBIENT) * theta, GRID, "index_excess", N_AMBIENT)])
+    settings, out = VelocityFit(resolution=24, max_iterations=20, time_limit=0, samples=2), tmp_path / "v.zarr"
+
+    def stop(iterate: Iterate) -> None:
+        if iterate.iterations == 8:
+            raise KeyboardInterrupt
+
+    with pytest.raises(Interrupted):
+        velocity_of_film(film, out, settings, on_iterate=stop)
+    lines: list[str] = []
+    velocity = velocity_of_film(film, out, settings, say=lines.append)
+    assert "continuing after 8 iterations" in lines
+    vectors = velocity.vectors(2)
+    middle = (r < 4) & ((h + 4.0 - RISE * TIMES[2]).abs() < 4)
+    speed = (vectors * torch.tensor(symmetry.direction)[:, None, None, None]).sum(dim=0)[middle]
+    assert float(speed.mean()) == pytest.approx(RISE / 1e3, rel=0.35)
+    across = vectors[1][middle].mean()
+    assert abs(float(across)) < 0.05 * float(speed.mean())
+    assert not bool(torch.isfinite(vectors[:, r > 19]).any())
+    assert velocity.attributes["symmetry"]["kind"] == "axis"
+    deviation = velocity.read("w_std", 2)
+    assert np.isfinite(deviation[middle.numpy()]).all()
+    with refused("gravity"):
+        velocity_of_film(film, tmp_path / "g.zarr", VelocityFit(gravity=(9810.0, 0.0, 0.0)))
 
 
 def test_an_interruption_while_writing_leaves_no_store(film: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -81,6 +81,8 @@ def _statements(store: VelocitySequence) -> list[Statement]:
         statements.append(Statement(kind, f"{verdict}: {deviation}; errors of the equations come on top."))
     share = float(np.isfinite(store.read("u", slice(None))).mean())
     where = "elsewhere (grey) the density is uniform, so that nothing shows how the fluid moves"
+    if store.attributes.get("symmetry"):
+        where += ", or a circle about the axis leaves the box"
     statements.append(Statement("note", f"Velocity is given in {share:.0%} of the box; {where}."))
     if store.attributes.get("physics") == "transport":
         lack = "velocity along surfaces of equal density follows only from continuity and smoothness"

@@ -86,8 +86,8 @@ def velocity_of_film(
     method = section.settings(settings)
     improvement = _improvement(store, theta, slice(first, last), measurement, density, say)
     displacements = None if improvement is None else improvement.inputs
-    place = [store.grid.box.lower, store.grid.box.upper, store.n_ambient]
-    inputs = digest([theta, list(times), place, _without_limits(settings), displacements])
+    place = [store.grid.box.lower, store.grid.box.upper, store.n_ambient, symmetry]
+    inputs = digest([theta, list(times), place, _without_limits(method), displacements])
     state = _resumed(checkpoint, inputs, say)
     saved = time.monotonic()
 
@@ -109,9 +109,9 @@ def velocity_of_film(
         flow = method(section.of(theta), section.grid, times, update, state, improvement, section.box)
     result = _write(out, store, theta, times, settings, flow, section)
     checkpoint.unlink(missing_ok=True)
-    determined = float(flow.determined.float().mean())
+    share = float(np.mean([np.isfinite(result.read("u", k)).mean() for k in range(len(times))]))
     say(
-        f"{out}: {len(times)} instants, velocity known in {determined:.0%} of the box, rms residual of transport "
+        f"{out}: {len(times)} instants, velocity known in {share:.0%} of the box, rms residual of transport "
         f"{flow.misfit:.2f} of its standard deviation, {flow.iterations} iterations, {flow.seconds:.0f} s"
     )
     return result
@@ -234,6 +234,8 @@ def _write(
         "settings": asdict(settings), "misfit": flow.misfit, "iterations": flow.iterations,
         "seconds": flow.seconds,
     }  # fmt: skip
+    if symmetry := film.attributes.get("symmetry"):
+        about["symmetry"] = symmetry
     residual = _at_instants(flow.transport)
     momentum = None if flow.momentum is None else _at_instants(flow.momentum.norm(dim=1))
     theta = theta if flow.theta is None else flow.theta

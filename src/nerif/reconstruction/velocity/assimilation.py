@@ -32,17 +32,19 @@ from nerif.reconstruction.velocity.flow import Flow
 from nerif.reconstruction.velocity.low_mach import LARGEST
 from nerif.reconstruction.velocity.periodic_box import PeriodicBox
 from nerif.reconstruction.velocity.problem import Problem, minimise, resampled
+from nerif.reconstruction.velocity.resampling import smooth
 from nerif.reconstruction.velocity.transport import Transport
 
 __all__ = ["PHYSICS", "Improvement", "Iterate", "State", "VelocityFit"]
 
 PHYSICS = ("boussinesq", "low-mach", "transport")
-LARGEST_DENSITY_CHANGE = {"boussinesq": 0.3, "low-mach": LARGEST}
-STAGES = ((0.67, 0.1), (1.0, 0.45), (1.0, 0.8))
+LARGEST_DENSITY_CHANGE = {"boussinesq": 0.3, "low-mach": LARGEST}  # of averages over SMOOTH voxels
+SMOOTH = (1.2, 1.2, 1.2)
+STAGES = ((0.67, 0.1), (1.0, 0.8))
 """Voxels along an edge, relative to the finest grid, and the share of the time at which the stage ends."""
-STAGES_WITH_DENSITY = ((0.67, 0.08), (0.67, 0.22), (1.0, 0.48), (1.0, 0.8))
-"""The same where the density is improved between stages."""
-MIN_VOXELS, MIN_FILM_VOXELS = 8, 4  # along the longest edge of the velocity; along each edge
+REPEATED_STAGES = ((0.67, 0.08), (0.67, 0.22), (1.0, 0.48), (1.0, 0.8))
+"""The same where the density is improved between stages, or the noise estimated from a velocity on the same grid."""
+MIN_VOXELS = 8  # along the longest edge of the velocity
 IMPROVEMENT = 0.4  # of the time left to a stage, for better densities before it
 SAMPLED = 0.5  # voxels along an edge of the grid of standard deviations, relative to the finest
 
@@ -104,7 +106,7 @@ class VelocityFit:
     time_limit: Annotated[float, Ge(0)] = 600.0
     """Limit on the duration, s (0: none)."""
     max_iterations: Count = 300
-    """Iterations on each grid at most."""
+    """Iterations of each stage at most."""
     density_noise: Annotated[float, Ge(0), Lt(math.inf)] = 0.0
     """Standard deviation of density / reference density, averaged over a voxel of the velocity (0: from the film)."""
     forcing: Annotated[float, Gt(0), Lt(1)] = 0.05
@@ -122,7 +124,7 @@ class VelocityFit:
     def __call__(
         self, theta: Float[Tensor, "t z y x"], grid: Grid, times: Sequence[float],
         on_iterate: Callable[[Iterate, State], None] = lambda iterate, state: None, resume: State | None = None,
-        improve: Improvement | None = None, box_of: Callable[[Grid], PeriodicBox] = PeriodicBox,
+        improve: Improvement | None = None, box_of: type[PeriodicBox] = PeriodicBox,
     ) -> Flow:  # fmt: skip
         """Return velocity and pressure of a film.
 
@@ -134,11 +136,11 @@ class VelocityFit:
         on_iterate : called after every evaluation, with the best state so far
         resume : state of an earlier run with the same input and settings
         improve : returns better densities, given the velocity; called between stages
-        box_of : returns the periodic box of a grid, in which the equations are solved
+        box_of : class of the periodic box in which the equations are solved
         """
         theta = theta.float()
-        self.check(theta, grid, times)
-        stages = STAGES if improve is None else STAGES_WITH_DENSITY
+        self.check(theta, grid, times, box_of)
+        stages = STAGES if improve is None and box_of is PeriodicBox else REPEATED_STAGES
         state = resume or State()
         first, begin = state.stage, time.monotonic() - state.seconds
         limit = self.time_limit or math.inf
@@ -163,7 +165,7 @@ class VelocityFit:
                     splines = problem.splines(problem.spectra(_controls(state)))
                 state = replace(state, theta=improve(problem.transport, splines, improved))
             before, density = problem, theta if state.theta is None else state.theta
-            problem = Problem(self, density, grid, times, box_of(self._grid(grid, share)))
+            problem = Problem(self, density, grid, times, box_of(self._grid(grid, share, box_of)))
             if state.controls is None:
                 controls = torch.zeros(len(times), 3, *problem.box.shape)
             else:
@@ -180,7 +182,7 @@ class VelocityFit:
         flow = problem.flow(_controls(state))
         deviations = None
         if self.samples:
-            coarse = Problem(self, density, grid, times, box_of(self._grid(grid, SAMPLED)))
+            coarse = Problem(self, density, grid, times, box_of(self._grid(grid, SAMPLED, box_of)))
             around = resampled(_controls(state), problem.box, coarse.box)
             deviations = deviations_of(
                 coarse, around, self.samples, self.sample_iterations,
@@ -189,7 +191,7 @@ class VelocityFit:
         seconds = time.monotonic() - begin
         return replace(flow, theta=state.theta, deviations=deviations, iterations=state.iterations, seconds=seconds)
 
-    def check(self, theta: Tensor, grid: Grid, times: Sequence[float]) -> None:
+    def check(self, theta: Tensor, grid: Grid, times: Sequence[float], box_of: type[PeriodicBox] = PeriodicBox) -> None:
         """Check the densities of a film, as for a call.
 
         Raises
@@ -201,32 +203,34 @@ class VelocityFit:
             raise InputError(f"expected three frames or more, got {len(times)}", field="film")
         if tuple(theta.shape) != (len(times), *grid.shape):
             raise InputError(f"expected densities of shape {(len(times), *grid.shape)}, got {tuple(theta.shape)}")
-        if min(n for n in grid.shape if n > 1) < MIN_FILM_VOXELS:
+        if any(n < fewest for n, fewest in zip(grid.shape, box_of.fewest, strict=True)):
             raise InputError(
-                f"expected {MIN_FILM_VOXELS} voxels or more along each edge, got {grid.shape} (z, y, x); run nerif "
-                "sequence with more --voxels", field="film",
+                f"expected {box_of.fewest} voxels or more (z, y, x), got {grid.shape}; run nerif sequence with more "
+                "--voxels", field="film",
             )  # fmt: skip
         if not bool(torch.isfinite(theta).all()):
             raise InputError(
                 "expected densities everywhere, got NaN: these equations have no bodies in the flow", field="film"
             )
-        largest = float(theta.abs().max())
-        if not largest > 0:
+        if not float(theta.abs().max()) > 0:
             raise InputError("the density is the same everywhere, so that nothing shows the velocity", field="film")
-        limit = LARGEST_DENSITY_CHANGE.get(self.physics, math.inf)
-        if largest > limit:
-            remedy = "low-mach for a hot gas without heat release, or transport"
+        changes = {"boussinesq": smooth(theta, SMOOTH).abs().max(), "low-mach": smooth(theta, SMOOTH).max()}
+        refused = {name: float(change) for name, change in changes.items() if change > LARGEST_DENSITY_CHANGE[name]}
+        if self.physics in refused:
+            remedy = (
+                "transport" if "low-mach" in refused else "low-mach for a hot gas without heat release, or transport"
+            )
             raise InputError(
-                f"expected density changes below {limit:.0%} for {self.physics}, got {largest:.0%}; give --physics "
-                f"{remedy if self.physics == 'boussinesq' else 'transport'} for an estimate", field="physics",
+                f"expected density changes below {LARGEST_DENSITY_CHANGE[self.physics]:.0%} for {self.physics}, got "
+                f"{refused[self.physics]:.0%}; give --physics {remedy}", field="physics",
             )  # fmt: skip
         if not float((theta[1:] - theta[:-1]).abs().max()) > 0:
             raise InputError("the density does not change in time, so that nothing shows the velocity", field="film")
 
-    def _grid(self, grid: Grid, share: float) -> Grid:
+    def _grid(self, grid: Grid, share: float, box_of: type[PeriodicBox]) -> Grid:
         count = max(MIN_VOXELS, round(self.resolution * share))
         shape = Grid.of_resolution(grid.box, min(count, max(grid.shape))).shape
-        nz, ny, nx = (1 if fine == 1 else max(n, MIN_FILM_VOXELS) for n, fine in zip(shape, grid.shape, strict=True))
+        nz, ny, nx = (max(n, fewest) for n, fewest in zip(shape, box_of.fewest, strict=True))
         return Grid(grid.box, (nz, ny, nx))
 
 

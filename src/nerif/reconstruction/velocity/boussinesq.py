@@ -72,7 +72,7 @@ class Boussinesq:
             moved = self._from_before(halfway, torch.cat([brought, splines[k, None]]), seconds)
             force = 0.5 * (moved[3] + buoyancy[k + 1])
             pushed = box.spectrum(moved[:3] - seconds * self.gravity * force)
-            velocity, pressed = self._projected(pushed, theta[k + 1], seconds, pressed)
+            velocity, pressed = self._projected(pushed, theta[k], theta[k + 1], seconds, pressed)
             if changes is not None:
                 velocity = velocity + changes[k]
             velocities.append(velocity)
@@ -117,18 +117,20 @@ class Boussinesq:
         return pressed
 
     def _projected(
-        self, pushed: Spectrum, theta: Float[Tensor, "z y x"], seconds: float, pressed: Spectrum
-    ) -> tuple[Spectrum, Spectrum]:
+        self, pushed: Spectrum, before: Float[Tensor, "z y x"], now: Float[Tensor, "z y x"], seconds: float,
+        pressed: Spectrum,
+    ) -> tuple[Spectrum, Spectrum]:  # fmt: skip
         """Velocity after pressure and viscosity, and -(acceleration by pressure).
 
         Parameters
         ----------
         pushed : velocity of the fluid that arrives, with all other forces
-        theta : now
+        before, now : theta
         pressed : an interval before
         """
         velocity = self.box.solenoidal(pushed)
-        return self.box.diffused(velocity, self.viscosity * seconds), (pushed - velocity) / (0.5 * seconds)
+        amount = self.viscosity * seconds
+        return self.box.filtered(velocity, lambda k2: torch.exp(-amount * k2)), (pushed - velocity) / (0.5 * seconds)
 
     def _force(self, velocity: Spectrum, theta: Float[Tensor, "z y x"]) -> Float[Tensor, "3 z y x"]:
         """-u . grad u, and buoyancy."""

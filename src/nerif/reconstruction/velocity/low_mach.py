@@ -13,6 +13,8 @@ Source: Rehm & Baum, J. Res. Natl. Bur. Stand. 83 (1978) 297; Dodd & Ferrante, J
 
 from __future__ import annotations
 
+import math
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -24,8 +26,7 @@ __all__ = ["LARGEST", "LowMach"]
 
 LARGEST = 0.9  # theta: ten times the ambient temperature
 HEAT = 1.7  # power of the temperature of viscosity and diffusivity
-ITERATIONS = 3  # of the pressure in each interval
-FIRST = 12  # the same where nothing is known of it
+FIRST, LATER = 1e-3, 0.05  # error of the pressure relative to that of its estimate: of none, and of the instant before
 
 
 class LowMach(Boussinesq):
@@ -49,40 +50,55 @@ class LowMach(Boussinesq):
     def _pressed(self, velocity: Spectrum, theta: Float[Tensor, "z y x"], rate: Float[Tensor, "z y x"]) -> Spectrum:
         temperature = self._temperature(theta)
         expansion = self.box.spectrum(self.diffusivity * temperature ** (HEAT + 1) * rate)  # its rate
-        wanted = self._potential_part(self.box.spectrum(self._force(velocity, theta))) - 1j * self.box.wave * expansion
-        return self._of_variable_density(wanted, temperature, torch.zeros_like(wanted), FIRST)
+        force = self._force(velocity, theta) + self._friction(velocity, temperature)
+        wanted = self._potential_part(self.box.spectrum(force)) - 1j * self.box.wave * expansion
+        return self._of_variable_density(wanted, temperature, torch.zeros(force.shape), FIRST)
+
+    def _friction(self, velocity: Spectrum, temperature: Tensor) -> Tensor:
+        """nu(T) lap u."""
+        return self.viscosity * temperature**HEAT * self.box.values(self.box.filtered(velocity, torch.neg))
 
     def _gradient(self, pressed: Spectrum, theta: Float[Tensor, "z y x"]) -> Spectrum:
         return self.box.spectrum(self.box.values(pressed) / self._temperature(theta))
 
     def _projected(
-        self, pushed: Spectrum, theta: Float[Tensor, "z y x"], seconds: float, pressed: Spectrum
-    ) -> tuple[Spectrum, Spectrum]:
-        temperature, expansion = self._temperature(theta), self._expansion(theta)
+        self, pushed: Spectrum, before: Float[Tensor, "z y x"], now: Float[Tensor, "z y x"], seconds: float,
+        pressed: Spectrum,
+    ) -> tuple[Spectrum, Spectrum]:  # fmt: skip
+        temperature, expansion = self._temperature(now), self._expansion(now)
         pushed = self._diffused(pushed, temperature, seconds)
         wanted = (self._potential_part(pushed) - expansion) / (0.5 * seconds)
-        pressed = self._of_variable_density(wanted, temperature, pressed, ITERATIONS)
+        gradient = self.box.values(pressed) / self._temperature(before)
+        pressed = self._of_variable_density(wanted, temperature, gradient, LATER)
         return self.box.solenoidal(pushed - 0.5 * seconds * pressed) + expansion, pressed
 
     def _diffused(self, velocity: Spectrum, temperature: Tensor, seconds: float) -> Spectrum:
         """Velocity after viscosity, between those of the smallest and the largest one."""
         box, relative = self.box, temperature**HEAT
         amount, lowest, highest = self.viscosity * seconds, float(relative.min()), float(relative.max())
-        least = box.diffused(velocity, amount * lowest)
+        least = box.filtered(velocity, lambda k2: torch.exp(-amount * lowest * k2))
         if not highest > lowest:
             return least
-        more = box.values(box.diffused(velocity, amount * highest) - least)
+        more = box.values(box.filtered(velocity, lambda k2: torch.exp(-amount * highest * k2)) - least)
         return least + box.spectrum((relative - lowest) / (highest - lowest) * more)
 
     def _potential_part(self, vectors: Spectrum) -> Spectrum:
         return vectors - self.box.solenoidal(vectors)
 
-    def _of_variable_density(self, wanted: Spectrum, temperature: Tensor, before: Spectrum, count: int) -> Spectrum:
-        """T grad p whose potential part is given, from an estimate of it."""
-        box = self.box
-        mean = 0.5 * (temperature.max() + temperature.min())
-        gradient = box.values(before) / temperature
-        for _ in range(count):
+    def _of_variable_density(
+        self, wanted: Spectrum, temperature: Tensor, gradient: Float[Tensor, "3 z y x"], tolerance: float
+    ) -> Spectrum:
+        """T grad p whose potential part is given.
+
+        Parameters
+        ----------
+        gradient : estimate of grad p
+        tolerance : of it, by which its error becomes smaller
+        """
+        box, lowest, highest = self.box, float(temperature.min()), float(temperature.max())
+        mean = 0.5 * (highest + lowest)
+        rate = (highest - lowest) / (highest + lowest)  # of an iteration
+        for _ in range(max(1, math.ceil(math.log(tolerance) / math.log(max(rate, tolerance))))):
             rest = self._potential_part(box.spectrum((temperature - mean) * gradient))
             gradient = box.values(wanted - rest) / mean
         return box.spectrum(temperature * gradient)

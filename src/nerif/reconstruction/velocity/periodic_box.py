@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from functools import cached_property
 
 import torch
@@ -29,6 +30,9 @@ class PeriodicBox:
     margin : width of the layer on each side, as a fraction of the edge of the box; 0: the box itself is periodic
     """
 
+    fewest = (4, 4, 4)
+    """Voxels of a film along z, y, x at least."""
+
     def __init__(self, grid: Grid, margin: float = 0.2) -> None:
         self.grid = grid
         self.shape = tuple(self._length(n, max(MIN_LAYERS, round(margin * n)) if margin > 0 else 0) for n in grid.shape)
@@ -42,10 +46,10 @@ class PeriodicBox:
         self.inverse_square = torch.where(self.wave_square > 0, 1 / self.wave_square.clamp_min(1e-30), 0.0)
 
     def _length(self, count: int, layers: int) -> int:
-        """Voxels along an edge, with layers on each side; of a flow in a plane one remains."""
+        """Voxels along an edge, with layers on each side."""
         from scipy.fft import next_fast_len
 
-        return int(next_fast_len(count + 2 * layers, real=True)) if layers and count > 1 else count
+        return int(next_fast_len(count + 2 * layers, real=True)) if layers else count
 
     def _frequencies(self, axis: int) -> Tensor:
         frequencies = torch.fft.rfftfreq if axis == 2 else torch.fft.fftfreq
@@ -86,9 +90,16 @@ class PeriodicBox:
         """Return the potential of the gradient in vectors, of mean 0: lap p = div v."""
         return (self.wave * spectrum).sum(dim=0) * (-1j * self.inverse_square)
 
-    def diffused(self, spectrum: Complex[Tensor, "3 z y xr"], amount: float) -> Complex[Tensor, "3 z y xr"]:
-        """Return vectors after diffusion: exp(amount lap) v, amount in mm^2."""
-        return spectrum * torch.exp(-amount * self.wave_square)
+    def filtered(
+        self, spectrum: Complex[Tensor, "3 z y xr"], response: Callable[[Tensor], Tensor]
+    ) -> Complex[Tensor, "3 z y xr"]:
+        """Return vectors of which the eigenfunctions of the Laplacian are multiplied by a response.
+
+        Parameters
+        ----------
+        response : of k^2 in 1/mm^2, -1 times the eigenvalues: exp(-amount k^2) for diffusion, -k^2 for the Laplacian
+        """
+        return spectrum * response(self.wave_square)
 
     def velocity(self, vorticity: Float[Tensor, "3 z y x"]) -> Complex[Tensor, "3 z y xr"]:
         """Return the spectrum of the velocity of divergence 0, and mean 0, with a vorticity: u = curl w / k^2."""
@@ -104,9 +115,18 @@ class PeriodicBox:
         """Return the Laplacian of scalars on a grid of the measurement, per mm^2."""
         return laplacian(values, grid.spacing[::-1])
 
-    def steady_noise(self, variance: Float[Tensor, "z y x"]) -> Tensor:
-        """Return the part of a film's variance of noise that does not grow with the change of density: none."""
+    def noise_by_place(self, variance: Float[Tensor, "z y x"]) -> Tensor:
+        """Return the part of a film's variance of noise that depends on the place, not on the change of density: 0."""
         return torch.zeros(())
+
+    def white(self, shape: Sequence[int], odd: bool, generator: torch.Generator) -> Tensor:
+        """Return white noise of variance 1, with the symmetry of the flow (odd for vorticity).
+
+        Parameters
+        ----------
+        shape : (..., z, y, x), of the box or of the measurement
+        """
+        return torch.randn(*shape, generator=generator)
 
     def low_pass(self, wavelength: float) -> Float[Tensor, "z y xr"]:
         """Return the response (1 + (k L / 2 pi)^2)^-1, scaled so that white fields keep their variance.

@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerif.common.conventions import InputError
 from nerif.geometry import Grid
 from nerif.reconstruction.velocity.boussinesq import Boussinesq
 from nerif.reconstruction.velocity.flow import Flow
@@ -108,8 +109,9 @@ class Problem:
 
     def sample(self, generator: torch.Generator) -> Sample:
         """Return a sample of the noise of the residual, and of the controls a priori."""
-        residual = torch.randn(self.transport.deviation.shape, generator=generator)
-        return Sample(residual, torch.randn(len(residual) + 1, 3, *self.box.shape, generator=generator))
+        residual = self.box.white(self.transport.deviation.shape, False, generator)
+        controls = self.box.white((len(residual) + 1, 3, *self.box.shape), True, generator)
+        return Sample(residual, controls)
 
     @torch.no_grad()
     def flow(self, controls: Tensor) -> Flow:
@@ -172,6 +174,10 @@ def minimise(
 
     with suppress(_End):
         optimiser.step(closure)
+    if not math.isfinite(lowest):
+        raise InputError(
+            "the residual of the first velocity is not a number; expected densities that are", field="film"
+        )
     return best, done
 
 

@@ -94,20 +94,23 @@ class Transport:
         """Return averages over the voxels of the velocity."""
         return along_axes(values, self._down)
 
-    def _deviation(self, noise: float, steady: Tensor) -> Tensor:
-        return (steady.clamp_min(self._floor**2) + (MODEL_ERROR**2 + noise**2) * self._local).sqrt()
+    def _deviation(self, noise: float, by_place: Tensor) -> Tensor:
+        return (by_place.clamp_min(self._floor**2) + (MODEL_ERROR**2 + noise**2) * self._local).sqrt()
 
     def weigh(self, residual: Float[Tensor, "t z y x"]) -> float:
-        """Estimate the noise of the densities from a residual, set `deviation`, and return it relative to the change.
+        """Estimate the noise of the densities from a residual, and set `deviation`.
+
+        Returns the part of it that grows with the change of density, relative to that.
 
         An error of one frame enters the residuals before and after it with opposite signs, so that their covariance is
         minus its variance; what the velocity does not explain yet has the same sign in both.
         """
         variance = -2 * (residual[1:] * residual[:-1]).sum(dim=0) / max(len(residual) - 1, 1)
         size = max(float(self._local.sum()) / len(self._local), 1e-30)
-        steady = self.box.steady_noise(variance)
-        noise = math.sqrt(max(0.0, float((variance - steady).sum())) / size)
-        self.deviation = self._deviation(noise, steady)
+        by_place = self.box.noise_by_place(variance)
+        rest = (variance - by_place)[variance != 0]
+        noise = math.sqrt(max(0.0, float(rest.sum())) / size)
+        self.deviation = self._deviation(noise, by_place)
         return noise
 
     @cached_property
