@@ -166,7 +166,8 @@ LIMITED = replace(SMALL, time_limit=257.0)
 @pytest.mark.parametrize(
     ("settings", "seconds", "steps", "options", "words"),
     [
-        (LIMITED, 18.0, 2, {}, ("18 s per step", "4.3 min allows about 14 steps", "100 steps would take 30 min")),
+        (LIMITED, 18.0, 2, {}, ("18 s per step", "4.3 min of training allow about 14 steps",
+                              "100 steps would take 30 min")),
         (LIMITED, 4.0, 40, {}, ("slow",)),
         (LIMITED, 4.0, PACE_STEPS - 2, {}, ()),  # too early
         (LIMITED, 1.0, 100, {}, ()),

@@ -7,11 +7,15 @@ from types import SimpleNamespace
 
 import pytest
 
+from nerif.fields.network import NetworkShape
 from nerif.reconstruction.neural.neural import NeRIF
+from nerif.reconstruction.progress import Monitor
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
+from nerif.results.directory import ResultDirectory
 from nerif.results.metrics import Metrics
 from nerif.workflow import budget
 from nerif.workflow.budget import LEAST, NO_LIMIT, Budget
+from nerif.workflow.job import Job, Run
 from nerif.workflow.steps import CLOSING, STEPS, Bootstrap, DrawErrors
 
 
@@ -43,6 +47,44 @@ def test_the_limit_counts_from_the_start_and_reserves_time_for_the_rest(measurem
     assert (by_network.limit, by_network.start) == (60.0, 990.0)
     assert by_network.reserve >= budget.REPORT
     assert Budget.of(Tikhonov(), measurement, 8, None).limit == 0
+
+
+@pytest.mark.parametrize(
+    ("limit", "reserve", "pace", "words"),
+    [
+        # 9 views of 1000 x 1000 px: 1.2 fits in 15 s
+        (60.0, 45.0, 0.1, ("--time-limit 60 is too short", "45 s", "12 s for the fit", "125 steps; 400 take 40 s",
+                           "--time-limit 100 or more")),
+        (60.0, 10.0, 0.1, ()),  # 417 steps
+        (60.0, 10.0, 0.3, ("139 steps", "--time-limit 160 or more")),  # a slow machine
+        (60.0, 50.0, 0.0, ("50 s", "8.3 s for the fit.", "--time-limit 100 or more")),  # voxels have no pace
+        (60.0, 45.0, 0.0, ()),
+        (60.0, 70.0, 0.1, ("5 s for the fit, about 50 steps", "--time-limit 140 or more")),  # nothing is left
+        (0.0, 70.0, 0.1, ()),
+    ],
+)  # fmt: skip
+def test_too_short_a_limit_is_said_with_what_it_would_take(clock, limit, reserve, pace, words):
+    text = Budget(limit, 1000.0, reserve, 400 if pace else 0, pace).shortage(0, validated=True)
+    assert bool(text) == bool(words)
+    assert all(word in text for word in words)
+
+
+def test_trials_and_the_prediction_of_the_withheld_view_take_time_too(clock):
+    limit = Budget(60.0, 1000.0, 10.0, 400, 0.1, projection=8.0)
+    assert not limit.shortage(0, validated=True)
+    assert "18 s, which leaves 13 s" in limit.shortage(2, validated=True)
+
+
+def test_too_short_a_limit_is_said_before_the_cross_validation(measurement, tmp_path, monkeypatch):
+    monkeypatch.setattr(budget, "REPORT", 900.0)
+    lines: list[str] = []
+    settings = NeRIF(network=NetworkShape(depth=1, width=8, octaves=1), time_limit=1000.0, max_steps=4, device="cpu")
+    out, monitor = ResultDirectory(tmp_path / "r"), Monitor(lines.append)
+    job = Job(out, measurement, settings, Run(), voxels=8, monitor=monitor, live=True)
+    assert job.validation is not None
+    assert job.view is not None
+    assert "--time-limit 1000 is too short" in lines[-1]
+    assert job.view.remark() == lines[-1]  # shown by the app
 
 
 def test_sampling_a_larger_volume_reserves_more_time(measurement):

@@ -16,13 +16,18 @@ from nerif.fields.network_kinds import network_in
 from nerif.geometry import Grid
 from nerif.reconstruction.base import Reconstructor
 from nerif.reconstruction.device import resolve_device
+from nerif.reconstruction.neural.schedule import duration
 from nerif.reconstruction.neural.settings import TrainingSettings
+from nerif.reconstruction.shared_settings import SHORT_RUN
 
 __all__ = ["NO_LIMIT", "Budget"]
 
 REPORT, PER_PIXEL = 2.5, 4e-6  # s: files, verdict and report; scores and images of the views
 LEAST = 0.1  # of the limit, for the fits
 PROBE = 16384  # points
+STEP = 3.2  # time of a training step per point, in evaluations: measured on a CPU, thin rays
+FEW = 0.5  # of the steps to the first convergence check: fits of fewer are poor (docs/decisions/020)
+LITTLE = 0.2  # of the limit: too little for the fits
 
 R = TypeVar("R", bound=Reconstructor)
 
@@ -36,15 +41,20 @@ class Budget:
     limit : s; 0: none
     start : time from which it counts, s since the epoch
     reserve : s, for what follows the fits
+    steps, pace, projection : of training, to the first convergence check, and s per step; s to project the field;
+        0 for methods without a network
     """
 
     limit: float
     start: float
     reserve: float
+    steps: int = 0
+    pace: float = 0.0
+    projection: float = 0.0
 
     @classmethod
     def of(cls, reconstructor: Reconstructor, measurement: Measurement, voxels: int, start: float | None) -> Budget:
-        """Return the budget of a job; the time to sample its field is measured on this machine.
+        """Return the budget of a job; the time to evaluate its field is measured on this machine.
 
         Parameters
         ----------
@@ -56,7 +66,13 @@ class Budget:
         if not limit:
             return cls(0.0, start, 0.0)
         pixels = sum(c.image_size[0] * c.image_size[1] for c in measurement.cameras)
-        return cls(limit, start, REPORT + PER_PIXEL * pixels + _sampling(reconstructor, measurement, voxels))
+        reserve = REPORT + PER_PIXEL * pixels
+        if not isinstance(reconstructor, TrainingSettings):
+            return cls(limit, start, reserve)
+        each, projection = _evaluation(reconstructor, measurement)
+        reserve += each * math.prod(Grid.of_resolution(measurement.box, voxels).shape) + projection
+        steps = min(reconstructor.first_cycle, reconstructor.max_steps or reconstructor.first_cycle)
+        return cls(limit, start, reserve, steps, STEP * each * reconstructor.points_per_batch, projection)
 
     def holding(self, seconds: float) -> Budget:
         """Return the budget with more time in reserve."""
@@ -76,20 +92,43 @@ class Budget:
         """Return settings with a share of the time that is left for fits; unchanged without a limit."""
         if not self.limit:
             return reconstructor
-        seconds = share * max(self.left, LEAST * self.limit)
-        return dataclasses.replace(reconstructor, time_limit=seconds)  # type: ignore[type-var]
+        return dataclasses.replace(reconstructor, time_limit=share * self._for_fits)  # type: ignore[type-var]
+
+    @property
+    def _for_fits(self) -> float:
+        return max(self.left, LEAST * self.limit)
+
+    def shortage(self, trials: int, validated: bool) -> str:
+        """Return that the limit leaves too little time for the fit, and what it would take; empty if it does not.
+
+        Parameters
+        ----------
+        trials : of the bootstrap
+        validated : whether a cross-validation comes first
+        """
+        if not self.limit:
+            return ""
+        budget, fits = self.holding(self.projection * validated), 1 + trials + SHORT_RUN * validated
+        seconds, rest, required = budget._for_fits / fits, self.limit - budget.left, self.steps * self.pace
+        if budget.left >= LITTLE * self.limit and seconds >= FEW * required:
+            return ""
+        text = f"--time-limit {self.limit:g} is too short: reading, prediction and report take about "
+        text += f"{duration(rest)}, which leaves {duration(seconds)} for the fit"
+        if self.pace:
+            text += f", about {seconds / self.pace:.0f} steps; {self.steps} take {duration(required)}, "
+            text += "by the time in which this machine evaluates the network"
+        enough = rest + max(fits * required, rest)  # at least half of it for the fits
+        return f"{text}. Give --time-limit {math.ceil(enough / 10) * 10} or more"
 
 
 NO_LIMIT = Budget(0.0, 0.0, 0.0)
 
 
-def _sampling(reconstructor: Reconstructor, measurement: Measurement, voxels: int) -> float:
-    """Time to sample a network for the volumes and the views, s: from that of a few points on this machine."""
-    if not isinstance(reconstructor, TrainingSettings):
-        return 0.0
-    device = resolve_device(reconstructor.device)
+def _evaluation(settings: TrainingSettings, measurement: Measurement) -> tuple[float, float]:
+    """Times to evaluate a network at a point and to project it into the views, s, by a few points on this machine."""
+    device = resolve_device(settings.device)
     with torch.random.fork_rng(devices=[]):
-        shape = reconstructor.resolved_by(measurement).network
+        shape = settings.resolved_by(measurement).network
         network = network_in(measurement.box, shape, bodies=measurement.bodies).to(device)
     points = torch.zeros(PROBE, 3, device=device)
     times = []
@@ -98,5 +137,5 @@ def _sampling(reconstructor: Reconstructor, measurement: Measurement, voxels: in
         with torch.no_grad():
             float(network(points).sum())  # waits for a GPU
         times.append(time.perf_counter() - start)
-    count = math.prod(Grid.of_resolution(measurement.box, voxels).shape)
-    return min(times) / PROBE * (count + evaluations(network, measurement.cameras, measurement.box, device))
+    each = min(times) / PROBE
+    return each, each * evaluations(network, measurement.cameras, measurement.box, device)

@@ -200,8 +200,7 @@ class Job:
         self.run = replace(run, gas=run.gas.for_measurement(self.inputs.measurement))
         for line in self.inputs.remarks:
             monitor.say(line)
-        pace = Pace(self.reconstructor, monitor.say)
-        self.monitor = monitor.telling(pace)
+        self.monitor = monitor
         if run.detail == "on":
             check_sigma(self.inputs.training)
         self.validation = self._cross_validation()
@@ -213,6 +212,11 @@ class Job:
         self.ranks = Ranks.from_environment()
         if self.ranks.size > 1:
             self._check_parallel()
+        shortage = "" if resume else self.budget.shortage(self.trials.members, self.validation is not None)
+        if shortage:
+            monitor.say(shortage)
+        pace = Pace(self.budget.allot(self.reconstructor, 1 / (1 + self.trials.members)), monitor.say, shortage)
+        self.monitor = monitor.telling(pace)
         self.method, self.initial = self.reconstructor, self.start
         self.measurement, self.withheld = self.inputs.measurement, self.inputs.withheld
         self.settings = self._settings(keep or {})

@@ -264,13 +264,18 @@ class Pace:
     """Callback that states once how long a run will take, or that its time limit allows too few steps.
 
     The first step does not count, since it may compile the network. Methods without a network have no pace.
+
+    Parameters
+    ----------
+    settings : with the time limit of the main training
+    say : called with the line
+    warning : that there is too little time, if that has been said before
     """
 
-    def __init__(self, settings: Reconstructor, say: Callable[[str], None]) -> None:
-        self.settings, self.say = settings, say
-        self.warning = ""  # that there is too little time
+    def __init__(self, settings: Reconstructor, say: Callable[[str], None], warning: str = "") -> None:
+        self.settings, self.say, self.warning = settings, say, warning
         self._first: Step | None = None
-        self._done = not isinstance(settings, TrainingSettings)
+        self._done = bool(warning) or not isinstance(settings, TrainingSettings)
 
     def __call__(self, step: Step) -> None:
         settings, first = self.settings, self._first
@@ -297,7 +302,7 @@ class Pace:
 def _too_slow(pace: float, limit: float, possible: float, planned: float) -> str:
     count, plan = (planned, "planned steps") if math.isfinite(planned) else (MIN_RUN, "steps")
     return (
-        f"slow: {duration(pace)} per step, so the time limit of {duration(limit)} allows about {possible:.0f} "
+        f"slow: {duration(pace)} per step, so the {duration(limit)} of training allow about {possible:.0f} "
         f"steps; {count:.0f} {plan} would take {duration(count * pace)}. Give a longer --time-limit, or fewer "
         "--points-per-batch and a smaller --network.width (--preset fast suits a CPU)"
     )
