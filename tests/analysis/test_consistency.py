@@ -25,7 +25,7 @@ from nerif.analysis.consistency import (
     unrelated_finding,
     without_spikes,
 )
-from nerif.analysis.residuals import CAUSES
+from nerif.analysis.remedies import CAUSES, advice
 from nerif.cli.cli import main
 from nerif.data.measurement import Measurement
 from nerif.fields.phantoms import make_phantom
@@ -409,4 +409,5 @@ def test_a_view_that_looks_past_the_box_does_not_end_the_check(small, tmp_path, 
 
 
 def test_a_wrong_pose_is_checked_before_it_is_refined():
-    assert CAUSES["calibration"].index("nerif check") < CAUSES["calibration"].index("--refine cameras")
+    text = advice(CAUSES["calibration"].remedies, {})
+    assert text.index("nerif check") < text.index("--refine cameras")

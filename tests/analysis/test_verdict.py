@@ -45,8 +45,9 @@ def first_run(withheld: float, fitted: float = 0.03) -> dict[str, Any]:
     return {"views": [noisy("a", withheld, True)], "fitted_views": [noisy("b", fitted)], "seconds": 1.0}
 
 
-def judged(**metrics: Any) -> Verdict:
-    return verdict(Result(Path(), settings={"method": "nerif"}, metrics=Metrics(**{"outcome": "steps", **metrics})))
+def judged(settings: dict[str, Any] | None = None, **metrics: Any) -> Verdict:
+    settings = {"method": "nerif", **(settings or {})}
+    return verdict(Result(Path(), settings=settings, metrics=Metrics(**{"outcome": "steps", **metrics})))
 
 
 VIEWS = [view(name) for name in "abcdef"]
@@ -127,6 +128,67 @@ def test_images_that_were_not_fitted_are_not_judged():
     assert verdict(Result(Path(), settings=settings, metrics=metrics)).sentence == (
         judged(views=views_of(0.02), cross_validation=first).sentence
     )
+
+
+REFINED = {"refine": ["cameras,shift"], "aperture": "auto", "withhold": ["auto"], "uncertainty": "fast"}
+LEARNING = [noisy(n, 0.04, **{"residual_test": {**WHITE, **CORRELATED, "cause": "calibration"}}) for n in "abcd"]
+UNLEARNED = [*LEARNING, noisy("e", 0.04), noisy("f", 0.07, **{"residual_test": LEARNING[0]["residual_test"]})]
+
+
+def with_cause(cause: str) -> list[dict[str, Any]]:
+    return [{**v, "residual_test": {**v["residual_test"], "cause": cause}} for v in LEARNING]
+
+
+@pytest.mark.parametrize(
+    ("cause", "option"),
+    [("calibration", "--refine cameras"), ("offset", "--refine shift"), ("blur", "--aperture auto")],
+)
+@pytest.mark.parametrize("outcome", ["time_limit", "converged"])
+def test_advice_leaves_out_what_the_run_has_in_use(cause, option, outcome):
+    views = with_cause(cause)
+    plain, using = (
+        judged(settings, views=views, cross_validation=first_run(0.05), outcome=outcome) for settings in ({}, REFINED)
+    )
+    assert option in plain.reasons
+    assert option not in using.reasons.replace(f"as {option} is in use", "")
+    assert ("detail not yet learned (a longer --time-limit" in using.reasons) == (outcome == "time_limit")
+    assert plain.error == using.error is not None
+
+
+def test_detail_not_yet_learned_is_no_wrong_pose_of_a_refined_rig():
+    metrics = {"views": UNLEARNED, "cross_validation": first_run(0.05), "outcome": "time_limit"}
+    assert judged(**metrics).rating == "do not use"
+    found = judged(REFINED, **metrics)
+    assert (found.rating, found.error) == ("use with care", pytest.approx(0.03, rel=0.3))
+    assert "f: 2.5% of the signal" in found.reasons
+    assert "wrong camera pose" not in found.reasons
+    far = [{**v, "rms": 0.4, "rms_white": 0.02} if v["name"] == "f" else v for v in UNLEARNED]
+    assert judged(REFINED, **{**metrics, "views": far}).rating == "do not use"  # more than the estimate accounts for
+
+
+@pytest.mark.parametrize(
+    ("settings", "names", "advised"),
+    [({}, "abcd", ("--withhold auto", "--uncertainty fast")), (REFINED, "abcd", ()),
+     ({}, "abc", ("--uncertainty fast",)), ({"withhold": ["auto"]}, "abcd", ("--uncertainty fast",))],
+)  # fmt: skip
+def test_advice_where_nothing_gives_an_estimate(settings, names, advised):
+    reasons = judged(settings, views=views_of(0.02, names)).reasons
+    assert [option for option in ("--withhold auto", "--uncertainty fast") if option in reasons] == list(advised)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "outcome", "trials", "word"),
+    [(6.0, "time_limit", 0, "use with care"), (40.0, "time_limit", 0, "use"), (6.0, "converged", 0, "use"),
+     (6.0, "time_limit", 8, "use")],
+)  # fmt: skip
+def test_a_fit_that_the_time_limit_cut_short(seconds, outcome, trials, word):
+    uncertainty = {"kind": "full", "source": "bootstrap", "trials": trials, "diverged_trials": [], "seconds": 1.0}
+    found = judged(
+        {"time_limit": 60.0}, views=VIEWS, cross_validation=FIRST, outcome=outcome, seconds=seconds,
+        uncertainty=uncertainty if trials else None,
+    )  # fmt: skip
+    assert found.rating == word
+    assert ("of the time limit of 60 s" in found.reasons) == (outcome == "time_limit")
 
 
 AXIS = {"kind": "axis", "harmonics": 0}

@@ -146,8 +146,9 @@ def test_fit_monitor_ignores_noise_missing_signal_and_skipped_steps():
     [(0.7, 0.0, "70%"), (0.2, 0.0, ""), (0.04, 0.01, "the residual is 2.0 sigma"), (0.012, 0.01, ""), (0.04, 0.0, "")],
 )
 def test_a_poor_fit_is_remarked(q, noise, remark):
-    text = monitor([q] * EMPTY_STEPS, noise=noise).remark
+    text, converged = (monitor([q] * EMPTY_STEPS, noise=noise).remark(end) for end in (False, True))
     assert remark in text
+    assert ("longer run" in text) == ("--network.width" in converged) == ("sigma" in remark)
     assert bool(text) == bool(remark)
 
 

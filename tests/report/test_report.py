@@ -221,7 +221,7 @@ FIT, GOOD = view(False, 0.99, 1.0), view(True, 0.99, 1.0)
         ([view(True, 0.99, None)], "note", "No training view"),
         ([SHIFTED, SHIFTED, FIT, GOOD], "warning", "up to 3.0% of the signal in a around row 20, column 36"),
         ([SHIFTED, SHIFTED, FIT, GOOD], "warning", "--refine cameras"),
-        ([PLAIN, FIT, GOOD], "note", "Likely cause: unknown"),
+        ([PLAIN, FIT, GOOD], "note", "Likely cause: a view that does not fit"),
         (None, "warning", "not compared with any view"),
     ],
 )

@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float
 
 from nerif.common.blocks import blocks
 
-__all__ = ["CAUSES", "Whiteness", "white_noise", "whiteness"]
+__all__ = ["Whiteness", "white_noise", "whiteness"]
 
 Map = Float[np.ndarray, "row column c"]
 Mask = Bool[np.ndarray, "row column"]
@@ -31,15 +31,6 @@ SIGNIFICANT = 4.0  # standard deviations of the grain of white noise
 MIN_GRAIN = {COARSE: 1.25, FINE: 1.1}  # below these, the correlated part is at most about half of the noise in a block
 MIN_SHARE = {COARSE: 0.2, FINE: 0.12}  # of the correlated part, that a cause has to explain
 
-CAUSES = {
-    "offset": "a shift of the whole image (camera shake): --refine shift, or nerif displacement --shake-border",
-    "calibration": "a wrong camera pose: nerif check finds images that are upside down, mirrored or exchanged; if it "
-    "finds none, --refine cameras",
-    "scale": "a wrong scale: distances, pixel pitch, sensitivity, or an evaluation method that underestimates",
-    "blur": "different sharpness of measurement and field: windows of optical flow, or the lens (--aperture)",
-}
-"""Patterns of residuals, their causes and the remedies."""
-
 
 @dataclass(frozen=True)
 class Whiteness:
@@ -49,7 +40,7 @@ class Whiteness:
     ----------
     grain : 1 for white noise, larger for correlated residuals
     white : whether it is compatible with white noise
-    cause : one of CAUSES, or empty
+    cause : one of remedies.CAUSES, or empty
     share : of the correlated part that the cause explains
     row, column : position of the largest block, px
     """

@@ -28,13 +28,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from nerif.analysis.asymmetry import camera_of
-from nerif.analysis.residuals import CAUSES
+from nerif.analysis.remedies import DEVIATIONS, WITHHOLD, advice, is_fitted, likely_cause, longer
 from nerif.data.volume import field_of
 from nerif.forward.registry import TECHNIQUES
 from nerif.results.directory import Result
 from nerif.results.metrics import HalfAsymmetry, ResidualTest, ViewScores
 
-__all__ = ["RATINGS", "Estimate", "Verdict", "correlated_share", "verdict"]
+__all__ = ["RATINGS", "Estimate", "Verdict", "correlated_share", "time_of_fit", "verdict"]
 
 RATINGS = ("use", "use with care", "do not use", "cannot tell")
 
@@ -51,12 +51,15 @@ OUTLIER = 1.5  # times the correlated part of the median view
 MIN_CAMERAS = 4
 ASYMMETRIC, NOT_SYMMETRIC = 0.25, 0.4  # antisymmetric share of the signal of a flow taken as axisymmetric
 UNEVEN = 1.35  # residual of the worst view over that of the median view, each relative to the signal
+LITTLE = 0.2  # of the time limit: a fit that had less was cut short
 FLOW = 0.02  # share of the largest value above which a voxel counts as flow
 
 ONE_CAMERA = (
     "with one camera no other view checks the calibration: lengths scale with its mm per px, and the index excess with "
     "the mm per px at the background over the distance from flow to background"
 )
+
+COMMON_MOTION = "without that of a common motion of field and refined cameras, which no view shows"
 
 View = ViewScores
 WHITE = ResidualTest(grain=1.0, white=True, cause="", share=0.0, row=0.0, column=0.0, correlated=0.0)
@@ -112,13 +115,12 @@ class Verdict:
     high: float | None = None
 
     @classmethod
-    def of(cls, rating: str, estimate: Estimate | None, reasons: Sequence[str], joint: str = "; ") -> Verdict:
+    def of(cls, rating: str, estimate: Estimate | None, reasons: Sequence[str]) -> Verdict:
         """Return a verdict with its reasons, the basis of the estimate first."""
-        text = joint.join(reason for reason in reasons if reason)
         if estimate is None:
-            return cls(rating, None, text)
-        basis = f"{estimate.basis}{joint if text else ''}{text}"
-        return cls(rating, estimate.error, basis, estimate.low, estimate.high)
+            return cls(rating, None, "; ".join(filter(None, reasons)))
+        text = "; ".join(filter(None, (estimate.basis, *reasons)))
+        return cls(rating, estimate.error, text, estimate.low, estimate.high)
 
     @property
     def sentence(self) -> str:
@@ -142,28 +144,30 @@ def verdict(result: Result) -> Verdict:
         share = _explained(group, _noise(fitted))
         if share is not None and share < MIN_EXPLAINED:
             text = f"the field explains {max(share, 0.0):.0%} of the squared signal of the {role} views (noise removed)"
-            return Verdict.of("do not use", None, [text])
+            return Verdict.of("do not use", None, [text, time_of_fit(result)])
     estimate, unavailable = _from_views(result, withheld, fitted)
     deviation = _deviation(result)
     if deviation is not None:
         other = Estimate.within(deviation, DEVIATIONS_FACTOR, "from its standard deviations")
         estimate = other if estimate is None else estimate.mean(other)
-    doubt, severe = _contradiction(fitted)
+    doubt, severe = _contradiction(fitted, result, estimate)
     symmetry = metrics.axis["symmetry"] if metrics.axis else {}
     axisymmetric = bool(symmetry) and not symmetry.get("harmonics")  # with harmonics the halves may differ
     if axisymmetric and any(d["antisymmetry"] > ASYMMETRIC for d in metrics.asymmetry):
         uneven, not_symmetric = _asymmetry(metrics.asymmetry)
         doubt, severe = "; ".join(filter(None, (uneven, doubt))), severe or not_symmetric
+    cameras = len({camera_of(v["name"]) for v in fitted})  # a view has an entry for each technique, or each half
+    time, common = time_of_fit(result), COMMON_MOTION if is_fitted("calibration", result.settings) else ""
     if severe:
         return Verdict.of("do not use", None, [doubt])
     if estimate is not None and estimate.error > MAX_CARE:
-        return Verdict.of("do not use", estimate, [doubt])
+        return Verdict.of("do not use", estimate, [common, doubt, time])
     if estimate is None and doubt:
-        return Verdict.of("use with care", None, [doubt, unavailable])
+        return Verdict.of("use with care", None, [doubt, unavailable, time])
     if estimate is None:
-        remedy = "--uncertainty fast computes standard deviations"
-        return Verdict.of("cannot tell", None, [unavailable or "no view was withheld", remedy])
-    cameras = len({camera_of(v["name"]) for v in fitted})  # a view has an entry for each technique, or each half
+        remedies = [WITHHOLD, DEVIATIONS] if cameras >= MIN_CAMERAS or axisymmetric else [DEVIATIONS]
+        reasons = [unavailable or "no view was withheld", advice(remedies, result.settings), time]
+        return Verdict.of("cannot tell", None, reasons)
     doubts = [doubt]
     if cameras == 1:
         doubts.append(ONE_CAMERA)
@@ -171,9 +175,9 @@ def verdict(result: Result) -> Verdict:
         doubts.append(f"{cameras} views leave much of the field undetermined")
     if outcome == "interrupted":
         doubts.append("the run was interrupted")
-    if any(doubts) or estimate.error > MAX_USE:
-        return Verdict.of("use with care", estimate, doubts, "; but ")
-    return Verdict.of("use", estimate, ["no view contradicts the others"])
+    if any(doubts) or estimate.error > MAX_USE or _short_of_time(result):
+        return Verdict.of("use with care", estimate, [common, *(f"but {text}" for text in doubts if text), time])
+    return Verdict.of("use", estimate, [common, "no view contradicts the others", time])
 
 
 def _percent(share: float) -> str:
@@ -254,7 +258,8 @@ def _from_views(
             share = _explained(first_fitted, noise)
             if share is not None and share < MIN_EXPLAINED:
                 run = f"the first run, without view {usable[0]['name']}, was too short for cross-validation"
-                return None, f"{run}: it explains {share:.0%} of its data"
+                more = f"; {longer(result)} makes it longer" if longer(result) else ""
+                return None, f"{run}: it explains {share:.0%} of its data{more}"
             largest, factor = _after_first_run(largest, fitted, first_fitted, noise), A_FIRST_RUN
         misfit, white, pixels = _misfit(fitted, noise)
         noisy = white * math.sqrt(N0_PIXELS / pixels) if pixels else white
@@ -319,28 +324,31 @@ def _deviation(result: Result) -> float | None:
     return float(std.values.double()[flow].norm()) / size if size > 0 else None
 
 
-def _contradiction(fitted: Sequence[View]) -> tuple[str, bool]:
+def _contradiction(fitted: Sequence[View], result: Result, estimate: Estimate | None) -> tuple[str, bool]:
     """Which view contradicts the others, and whether severely.
 
     Correlated noise, as of interrogation windows, is in every view; a contradiction is an outlier, or has a pattern.
+    Where the fit includes the cause of the pattern, the residual is severe if the estimate does not account for it.
     """
     for name in dict.fromkeys(v["measured"] for v in fitted):
         group = [v for v in fitted if v["measured"] == name]
         parts = {v["name"]: correlated_share(v) for v in group}
-        median, worst = statistics.median(parts.values()), max(parts, key=lambda k: parts[k])
+        limit = OUTLIER * statistics.median(parts.values())
         tests = {v["name"]: v.get("residual_test", WHITE) for v in group}
         doubtful = [
             view for view, test in tests.items()
-            if test["grain"] > DOUBTFUL[0] and parts[view] > DOUBTFUL[1]
-            and (test["cause"] or parts[view] > OUTLIER * median)
+            if test["grain"] > DOUBTFUL[0] and parts[view] > DOUBTFUL[1] and (test["cause"] or parts[view] > limit)
         ]  # fmt: skip
         if doubtful:
+            worst = max(doubtful, key=lambda view: parts[view])
+            grain, cause, part = tests[worst]["grain"], tests[worst]["cause"], parts[worst]
             views = f"residuals of {len(doubtful)} views are"
-            views = views if len(doubtful) > 1 else f"the residual of view {doubtful[0]} is"
-            grain, cause = tests[worst]["grain"], tests[worst]["cause"]
-            text = f"{views} spatially correlated ({worst}: {parts[worst]:.1%} of the signal)"
-            text += f", as with {CAUSES[cause]}" if cause else "; nerif check compares the views with one another"
-            return text, grain > SEVERE[0] and parts[worst] > SEVERE[1] and parts[worst] > OUTLIER * median
+            views = views if len(doubtful) > 1 else f"the residual of view {worst} is"
+            severe = grain > SEVERE[0] and part > SEVERE[1] and part > limit
+            if severe and is_fitted(cause, result.settings):
+                cause, severe = "", estimate is None or part > estimate.high
+            likely = likely_cause(cause, result)
+            return f"{views} spatially correlated ({worst}: {part:.1%} of the signal), as with {likely}", severe
         shares = {v["name"]: v["rms"] / v["rms_predicted"] for v in group}
         worst, median = max(shares, key=lambda k: shares[k]), statistics.median(shares.values())
         if median > 0 and shares[worst] > UNEVEN * median:
@@ -361,3 +369,24 @@ def correlated_share(view: View) -> float:
     """Return the spatially correlated part of the residual of a view, relative to the rms prediction."""
     test = view.get("residual_test")
     return float(test["correlated"] * view["rms"] / (view.get("rms_predicted") or math.inf)) if test else 0.0
+
+
+def time_of_fit(result: Result) -> str:
+    """Return how much of the time limit the fit had; empty if it did not end there."""
+    share = _share_of_limit(result)
+    if share is None:
+        return ""
+    seconds = share * result.settings["time_limit"]
+    return f"the fit had {seconds:.0f} s of the time limit of {result.settings['time_limit']:g} s ({share:.0%})"
+
+
+def _short_of_time(result: Result) -> bool:
+    """Whether the time limit has cut the fit short; a bootstrap trial has as much time as the fit."""
+    share, uncertainty = _share_of_limit(result), result.metrics.uncertainty
+    trials = uncertainty["trials"] if uncertainty and uncertainty.get("source") == "bootstrap" else 0
+    return share is not None and share * (1 + trials) < LITTLE
+
+
+def _share_of_limit(result: Result) -> float | None:
+    limit, seconds = float(result.settings.get("time_limit", 0.0)), result.metrics.seconds
+    return seconds / limit if result.metrics.outcome == "time_limit" and limit and seconds is not None else None

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from nerif.analysis.evaluation import rms_with_unit
-from nerif.analysis.residuals import CAUSES
-from nerif.analysis.verdict import correlated_share, verdict
+from nerif.analysis.remedies import WITHHOLD, Remedy, advice, likely_cause, longer
+from nerif.analysis.verdict import correlated_share, time_of_fit, verdict
 from nerif.common.conventions import with_unit
 from nerif.data.volume import INDEX, field_of, name_of
 from nerif.forward.registry import TECHNIQUES
@@ -194,7 +194,8 @@ def statements(result: Result) -> list[Statement]:
 
 def _of_outcome(result: Result) -> list[Statement]:
     outcome, message = result.metrics.outcome, result.metrics.message or ""
-    limit = "The run stopped at its {}; a longer run may reduce the error."
+    time = time_of_fit(result)
+    limit = f"The run stopped at its {{}}{f' ({time})' if time else ''}; {longer(result)} may reduce the error."
     level, text = {
         "diverged": ("bad", f"The run diverged. {message}"),
         "collapsed": ("bad", f"The field collapsed to the ambient. {message}"),
@@ -212,7 +213,8 @@ def _of_withheld_views(result: Result) -> list[Statement]:
             text = "The field was not compared with any view; nerif evaluate --measurement FILE does so."
         else:
             text = "No view was withheld, so the field is not validated against independent data. "
-            text += "Repeat with --withhold auto, or the name of a view."
+            repeat = Remedy("Repeat with --withhold auto, or the name of a view.", WITHHOLD.setting, WITHHOLD.values)
+            text += advice([repeat], result.settings) or "Repeat with --withhold and the name of a view."
         return [Statement("warning", text)]
     views = [v for v in withheld or first_run if math.isfinite(v["cc"])]
     if not views:
@@ -229,7 +231,8 @@ def _of_withheld_views(result: Result) -> list[Statement]:
         return [Statement("warning" if beyond else "good", text)]
     text = f"The withheld view {name}{among} is predicted poorly: CC {cc:.3f}. "
     level = "warning" if cc >= 0.8 or (noise is not None and noise <= 2) else "bad"
-    return [Statement(level, text + "More views, or a check of the calibration (nerif check), may help.")]
+    remedies = ", ".join(filter(None, ("More views", longer(result), "or a check of the calibration (nerif check)")))
+    return [Statement(level, f"{text}{remedies}, may help.")]
 
 
 def _of_residuals(result: Result) -> list[Statement]:
@@ -251,7 +254,10 @@ def _of_residuals(result: Result) -> list[Statement]:
         white = bool((highest.get("residual_test") or {"white": False})["white"])
         level = "warning" if high <= 3 or white else "bad"  # a white residual may be noise with a wrong sigma
         text = f"The residual of training view {_place(highest, views)} is {high:.1f} × the stated noise. "
-        text += "Possible causes: a short run, open faces, the calibration (nerif check), a sigma that is too small."
+        short = f"a short run ({longer(result)})" if longer(result) else ""
+        faces = "" if result.settings.get("open_faces") else "flow that leaves the box (--open-faces)"
+        causes = (short, faces, "the calibration (nerif check)", "a sigma that is too small")
+        text += f"Possible causes: {', '.join(filter(None, causes))}."
         remarks.append(Statement(level, text))
     if low < NOISE_RANGE[0]:
         text = f"The residual of training view {_place(lowest, views)} is {low:.2f} × the stated noise: "
@@ -274,8 +280,7 @@ def _of_correlated_residuals(result: Result) -> list[Statement]:
         verb = verb if len(group) > 1 else f"The residual of training view {names} is"
         where = f"row {worst['residual_test']['row']:.0f}, column {worst['residual_test']['column']:.0f}"
         text = f"{verb} spatially correlated, up to {share:.1%} of the signal in {_place(worst, views)} around {where}."
-        reason = CAUSES.get(cause, "unknown; perhaps flow beyond the box, or a short run")
-        text += f" Likely cause: {reason}."
+        text += f" Likely cause: {likely_cause(cause, result)}."
         remarks.append(Statement("warning" if share > CORRELATED else "note", text))
     return remarks
 

@@ -33,7 +33,7 @@ class ResidualTest(TypedDict):
     grain: float
     """1 for white noise, larger for correlated residuals."""
     cause: str
-    """Whose pattern it has (residuals.CAUSES), or empty."""
+    """Whose pattern it has (remedies.CAUSES), or empty."""
     share: float
     """Of the correlated part that the cause explains."""
     row: float

@@ -225,17 +225,17 @@ class FitMonitor(Resumable):
             return self.since >= MIN_STEPS and self.unexplained > HALF
         return self.since >= (MIN_STEPS if final else self.patience) and self.unexplained > EMPTY
 
-    @property
-    def remark(self) -> str:
-        """Remark on a poor fit at the end of a run, or nothing."""
+    def remark(self, converged: bool) -> str:
+        """Return a remark on a poor fit at the end of a run, or nothing."""
         if self.since < MIN_STEPS:
             return ""
         if self.unexplained > HALF:
             return f"; {self.unexplained:.0%} of the squared signal without noise is not explained yet"
         if self.sigmas > HIGH_RESIDUAL:
+            remedy = "a larger --network.width" if converged else "a longer run"
             return (
-                f"; the residual is {self.sigmas:.1f} sigma: more time or a larger --network.width lowers it, "
-                "more views the error, unless cameras or sigma are wrong (nerif check)"
+                f"; the residual is {self.sigmas:.1f} sigma: {remedy} lowers it, more views the error, "
+                "unless cameras or sigma are wrong (nerif check)"
             )
         return ""
 
@@ -297,11 +297,10 @@ class DivergenceGuard(Callback):
                 "try a smaller --learning-rate or --precision float32",
             )
 
-    @property
-    def remark(self) -> str:
-        """Remark at the end of a run, or nothing."""
+    def remark(self, converged: bool) -> str:
+        """Return a remark at the end of a run, or nothing."""
         again = f"; rolled back {self.rollbacks} time(s) to the last good state" if self.rollbacks else ""
-        return again + self.monitor.remark
+        return again + self.monitor.remark(converged)
 
     def state_dict(self) -> dict[str, Any]:
         return {"rollbacks": self.rollbacks, "monitor": self.monitor.state_dict()}

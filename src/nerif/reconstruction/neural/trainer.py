@@ -130,7 +130,8 @@ class Trainer:
         assert outcome is not None
         self.convergence.take_best(self)
         if not outcome.failed:
-            outcome = Outcome(outcome.reason, outcome.message + self.guard.remark + self.network.remark)
+            remark = self.guard.remark(outcome.reason == "converged") + self.network.remark
+            outcome = Outcome(outcome.reason, outcome.message + remark)
         self.field.network.eval().requires_grad_(False)
         errors = self.objective.gauge_errors(LEVEL_POINTS, torch.Generator().manual_seed(0))
         if errors is not None and self.data.gauge_free and self.field.network.limits == UNBOUNDED:
