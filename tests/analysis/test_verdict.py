@@ -155,6 +155,13 @@ def test_advice_leaves_out_what_the_run_has_in_use(cause, option, outcome):
     assert plain.error == using.error is not None
 
 
+@pytest.mark.parametrize("cause", ["blur", "scale"])
+def test_a_field_that_is_smooth_by_its_method_is_named_before_the_measurement(cause):
+    metrics = {"views": with_cause(cause), "cross_validation": first_run(0.05), "outcome": "converged"}
+    assert "as with smoothing by tv, or " in judged({"method": "tv"}, **metrics).reasons
+    assert "smoothing by" not in judged(**metrics).reasons
+
+
 def test_detail_not_yet_learned_is_no_wrong_pose_of_a_refined_rig():
     metrics = {"views": UNLEARNED, "cross_validation": first_run(0.05), "outcome": "time_limit"}
     assert judged(**metrics).rating == "do not use"

@@ -74,7 +74,8 @@ LONGER = {
     "time_limit": "a longer --time-limit", "steps": "more --max-steps", "epochs": "more --epochs",
     "iterations": "more --iterations", "interrupted": "--resume",
 }  # fmt: skip
-SMOOTHED = "blur"  # the pattern that detail leaves which is not yet learned
+NETWORK = "nerif"  # the method without a penalty
+SMOOTHED = ("blur", "scale")  # patterns that a field leaves, too, which is not yet learned or regularised
 
 
 def advice(remedies: Sequence[Remedy], settings: Mapping[str, Any]) -> str:
@@ -101,14 +102,18 @@ def likely_cause(cause: str, result: Result) -> str:
     cause : whose pattern it has, one of CAUSES, or empty
     """
     entry, option, settings = CAUSES.get(cause), longer(result), result.settings
-    unlearned = f"detail not yet learned ({option} may reduce it)" if option else "detail that the field cannot resolve"
+    field = "detail that the field cannot resolve"
+    if option:
+        field = f"detail not yet learned ({option} may reduce it)"
+    elif cause in SMOOTHED:
+        field = f"smoothing by {settings['method']}" if settings.get("method", NETWORK) != NETWORK else ""
     if entry is None:
         other = "a view that does not fit the others, or flow beyond the box (nerif check)"
-        return f"{unlearned}, or {other}" if option else other
+        return f"{field}, or {other}" if option else other
     if is_fitted(cause, settings):
-        return f"{unlearned}, as --refine {entry.group} is in use"
+        return f"{field}, as --refine {entry.group} is in use"
     text = ": ".join(filter(None, (entry.words, advice(entry.remedies, settings))))
-    return f"{unlearned}, or {text}" if option and cause == SMOOTHED else text
+    return f"{field}, or {text}" if field and cause in SMOOTHED else text
 
 
 def _words(value: Any) -> tuple[str, ...]:
