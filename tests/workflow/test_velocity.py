@@ -20,6 +20,7 @@ from nerif.data.vti import read_vti
 from nerif.geometry import Box, Grid
 from nerif.geometry.symmetry import Symmetry
 from nerif.reconstruction.velocity.assimilation import Iterate, VelocityFit
+from nerif.report import velocity_page
 from nerif.workflow.velocity import velocity_of_film
 from refusals import refused
 
@@ -83,6 +84,13 @@ def test_the_ring_is_found_to_rise_and_the_ambient_is_unknown(velocity: Path):
     assert kind_of(velocity) is VELOCITY
     page = velocity.with_suffix(".html").read_text()
     assert "standard deviation of the velocity is" in page
+
+
+@pytest.mark.parametrize(("seconds", "limit", "more"), [(30.0, 30.0, True), (20.0, 30.0, False), (20.0, 0.0, False)])
+def test_more_time_is_advised_to_a_fit_that_the_limit_ended(tmp_path: Path, seconds: float, limit: float, more: bool):
+    about = {"misfit": 3.0, "seconds": seconds, "settings": {"time_limit": limit}}
+    store = VelocitySequence.begin(tmp_path / "v.zarr", (0.0,), GRID, (), about)
+    assert ("more time" in velocity_page._statements(store)[0].text) == more
 
 
 def test_report_movie_and_paraview_show_vectors(velocity: Path, tmp_path: Path):

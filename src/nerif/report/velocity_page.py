@@ -71,7 +71,10 @@ def _statements(store: VelocitySequence) -> list[Statement]:
     if misfit <= WELL:
         statements = [Statement("good", f"The velocity explains how the density moves: {size}.")]
     else:
-        remedy = "give more time (--time-limit), a finer grid (--resolution), or check physics and properties"
+        limit = store.attributes.get("settings", {}).get("time_limit") or math.inf
+        ended = store.attributes.get("seconds", 0.0) >= limit
+        more = "more time (the fit ended at its --time-limit), " if ended else ""
+        remedy = f"give {more}a finer grid (--resolution), or check physics and properties"
         statements = [Statement("warning", f"The velocity explains the film in part: {size}; {remedy}.")]
     if (spread := relative_deviation(store, COMPONENTS)) is not None:
         kind, verdict = next((k, words) for limit, k, words in VERDICTS if spread <= limit)
