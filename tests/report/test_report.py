@@ -232,6 +232,27 @@ def test_statements_on_views(tmp_path, views, level, phrase):
 
 
 @pytest.mark.parametrize(
+    ("views", "setting", "option"),
+    [
+        ([SHIFTED, SHIFTED, FIT, GOOD], {"refine": ["cameras"]}, "if it finds none, --refine cameras"),
+        ([FIT], {"withhold": ["auto"]}, "--withhold auto"),
+        ([view(False, 0.99, 2.0), GOOD], {"open_faces": ["z+"]}, "--open-faces"),
+    ],
+)
+def test_statements_advise_no_option_that_is_in_use(tmp_path, views, setting, option):
+    for settings, advised in (({}, True), (setting, False)):
+        found = statements(Result(tmp_path, settings=settings, metrics=Metrics(views=views)))
+        assert any(option in s.text for s in found) == advised
+
+
+@pytest.mark.parametrize(("outcome", "advised"), [("time_limit", True), ("converged", False)])
+def test_a_longer_run_is_advised_only_to_one_that_a_limit_ended(tmp_path, outcome, advised):
+    views = [view(False, 0.99, 2.0), view(True, 0.5, 3.0)]
+    found = statements(Result(tmp_path, metrics=Metrics(views=views, outcome=outcome)))
+    assert sum("a longer --time-limit" in s.text for s in found) == 3 * advised  # withheld view, residuals, limit
+
+
+@pytest.mark.parametrize(
     ("metrics", "level", "phrase"),
     [
         ({"cc": 0.5, "l2_variation": 0.9}, "bad", "90.0%"),
