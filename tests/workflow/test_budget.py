@@ -75,6 +75,13 @@ def test_trials_and_the_prediction_of_the_withheld_view_take_time_too(clock):
     assert "18 s, which leaves 13 s" in limit.shortage(2, validated=True)
 
 
+def test_voxel_methods_count_iterations(measurement, clock):
+    fine = Budget.of(Tikhonov(voxels=400, time_limit=5.0, device="cpu"), measurement, 400, None)
+    coarse = Budget.of(Tikhonov(voxels=100, time_limit=5.0, device="cpu"), measurement, 100, None)
+    assert fine.pace == pytest.approx(4 * coarse.pace, rel=0.2)
+    assert "iterations on the finest grid; 50 take" in dataclasses.replace(fine, pace=1.0).shortage(0, validated=True)
+
+
 def test_too_short_a_limit_is_said_before_the_cross_validation(measurement, tmp_path, monkeypatch):
     monkeypatch.setattr(budget, "REPORT", 900.0)
     lines: list[str] = []

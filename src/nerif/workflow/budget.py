@@ -19,6 +19,7 @@ from nerif.reconstruction.device import resolve_device
 from nerif.reconstruction.neural.schedule import duration
 from nerif.reconstruction.neural.settings import TrainingSettings
 from nerif.reconstruction.shared_settings import SHORT_RUN
+from nerif.reconstruction.voxels.settings import VoxelReconstructor
 
 __all__ = ["NO_LIMIT", "Budget"]
 
@@ -27,6 +28,8 @@ LEAST = 0.1  # of the limit, for the fits
 PROBE = 16384  # points
 STEP = 3.2  # time of a training step per point, in evaluations: measured on a CPU, thin rays
 FEW = 0.5  # of the steps to the first convergence check: fits of fewer are poor (docs/decisions/020)
+TRAINING = "steps", "the time in which this machine evaluates the network"
+ITERATIONS = "iterations on the finest grid", "the speed of a usual CPU"
 LITTLE = 0.2  # of the limit: too little for the fits
 
 R = TypeVar("R", bound=Reconstructor)
@@ -41,8 +44,9 @@ class Budget:
     limit : s; 0: none
     start : time from which it counts, s since the epoch
     reserve : s, for what follows the fits
-    steps, pace, projection : of training, to the first convergence check, and s per step; s to project the field;
-        0 for methods without a network
+    steps, pace : of the main fit, that are enough, and s per step; 0 if unknown
+    words : name of these steps, and what the pace follows from
+    projection : s, to project a network into the views
     """
 
     limit: float
@@ -50,6 +54,7 @@ class Budget:
     reserve: float
     steps: int = 0
     pace: float = 0.0
+    words: tuple[str, str] = TRAINING
     projection: float = 0.0
 
     @classmethod
@@ -67,12 +72,17 @@ class Budget:
             return cls(0.0, start, 0.0)
         pixels = sum(c.image_size[0] * c.image_size[1] for c in measurement.cameras)
         reserve = REPORT + PER_PIXEL * pixels
+        grid = Grid.of_resolution(measurement.box, voxels)
+        if isinstance(reconstructor, VoxelReconstructor) and resolve_device(reconstructor.device).type == "cpu":
+            finest = Grid.of_resolution(measurement.box, reconstructor.voxels)
+            pace = reconstructor.iteration_seconds(measurement, finest, torch.get_num_threads())
+            return cls(limit, start, reserve, reconstructor.iterations, pace, ITERATIONS)
         if not isinstance(reconstructor, TrainingSettings):
             return cls(limit, start, reserve)
         each, projection = _evaluation(reconstructor, measurement)
-        reserve += each * math.prod(Grid.of_resolution(measurement.box, voxels).shape) + projection
+        reserve += each * math.prod(grid.shape) + projection
         steps = min(reconstructor.first_cycle, reconstructor.max_steps or reconstructor.first_cycle)
-        return cls(limit, start, reserve, steps, STEP * each * reconstructor.points_per_batch, projection)
+        return cls(limit, start, reserve, steps, STEP * each * reconstructor.points_per_batch, TRAINING, projection)
 
     def holding(self, seconds: float) -> Budget:
         """Return the budget with more time in reserve."""
@@ -115,8 +125,8 @@ class Budget:
         text = f"--time-limit {self.limit:g} is too short: reading, prediction and report take about "
         text += f"{duration(rest)}, which leaves {duration(seconds)} for the fit"
         if self.pace:
-            text += f", about {seconds / self.pace:.0f} steps; {self.steps} take {duration(required)}, "
-            text += "by the time in which this machine evaluates the network"
+            name, basis = self.words
+            text += f", about {seconds / self.pace:.0f} {name}; {self.steps} take {duration(required)}, by {basis}"
         enough = rest + max(fits * required, rest)  # at least half of it for the fits
         return f"{text}. Give --time-limit {math.ceil(enough / 10) * 10} or more"
 

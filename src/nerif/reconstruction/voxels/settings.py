@@ -33,6 +33,7 @@ __all__ = ["VoxelReconstructor", "WeightedVoxelReconstructor"]
 VOLUME_ARRAYS = 22  # arrays of the size of the grid held by the most demanding method (tests/reconstruction)
 DATA_ARRAYS = 8  # arrays of the size of the data
 COMPILER_BYTES = 1 << 28  # of Numba, for any grid (benchmarks/results/voxel-cost-cpu.md)
+RAY_SECONDS = 2.5e-8  # of an iteration on one core, per ray and voxel along the longest edge (same table)
 MIN_VOXELS = 8  # along the longest edge in the cross-validation run
 
 
@@ -113,6 +114,11 @@ class VoxelReconstructor(SharedSettings):
         preparing = 40 * 8 * rays * per_pixel  # rays in double precision, while the operator is set up
         overhead = kernels_torch.CHUNK_BYTES if device == "cuda" else COMPILER_BYTES
         return self.operator_bytes(measurement, grid) + volumes + data + preparing + overhead
+
+    def iteration_seconds(self, measurement: Measurement, grid: Grid, cores: int) -> float:
+        """Return about the time of an iteration on cores of a usual CPU, s."""
+        rays = sum(count for count, _ in _ray_counts(measurement, grid)) * _lens_rays(measurement, grid)
+        return RAY_SECONDS * rays * max(grid.shape) / cores
 
     def __call__(
         self, measurement: Measurement, on_step: OnStep | None = None, resume: State | None = None,
