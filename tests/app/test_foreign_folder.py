@@ -11,11 +11,14 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
+from nicegui import Client, ui
 
 from app.serving import answering, end, free_port, outside
+from nerif.app.elements import card
 from nerif.app.jobs import Jobs
 from nerif.app.private import secret
 from nerif.app.project import Project
+from nerif.app.sliders import RangeSlider
 from nerif.app.workspace import Workspace
 from nerif.common.conventions import InputError
 from refusals import refused
@@ -88,6 +91,24 @@ def test_settings_and_drafts_that_are_none_break_nothing(tmp_path, text):
     work = Workspace(Project(tmp_path))
     assert work.draft("design") == {}
     assert work.jobs.at_once == 1
+
+
+def test_drafts_name_no_cluster(tmp_path):
+    (tmp_path / ".nerif").mkdir()
+    values = {"cluster": "tcp://10.0.0.1:8786", "voxels": 40}
+    (tmp_path / ".nerif" / "drafts.json").write_text(json.dumps({"reconstruct": {"film_values": values}}))
+    assert Workspace(Project(tmp_path)).draft("reconstruct") == {"film_values": {"voxels": 40}}
+
+
+@pytest.mark.parametrize("title", ["a :title=location.href \\", 'of "cam" & <b>', "plain"])
+def test_a_name_gives_an_element_no_property_of_its_own(title):
+    with Client(ui.page("/")):
+        with card(title) as section:
+            slider = RangeSlider(title, 3, 1, lambda step: title, on_change=lambda step: None)  # type: ignore[arg-type]
+        assert dict(section.props) == {"aria-label": title}
+        names = {"type", "min", "max", "step", "value", "aria-label", "aria-valuetext"}
+        assert {*slider._input.props} == names
+        assert slider._input.props["aria-valuetext"] == title
 
 
 def test_a_run_that_is_not_signed_is_shown_and_never_started(tmp_path):

@@ -197,7 +197,7 @@ def test_a_page_that_cannot_be_kept_from_others_is_refused(tmp_path, monkeypatch
 
 
 def test_a_token_may_stand_in_a_file_instead_of_the_command_line(tmp_path):
-    (tmp_path / "app.toml").write_text('host = "0.0.0.0"\ntoken = "0123456789abcdef"\n')
+    (tmp_path / "app.toml").write_text('token = "0123456789abcdef"\n')
     settings = read_settings(App(), [str(tmp_path), "--config", str(tmp_path / "app.toml")], "app")
     assert (settings.folder, settings.token) == (tmp_path, "0123456789abcdef")
 

@@ -390,6 +390,25 @@ def test_invalid_settings_files(work, tmp_path, refusal, text, words):
     assert not (tmp_path / "r").exists()
 
 
+@pytest.mark.parametrize(
+    ("command", "entry"),
+    [
+        ("sequence", 'cluster = "tcp://127.0.0.1:9"'),
+        ("sequence", 'cluster = "slurm.yaml"'),
+        ("sequence", "dashboard = true"),
+        ("simulate", "force = true"),
+        ("app", 'host = "0.0.0.0"\ntoken = "0123456789abcdef"'),
+    ],
+)
+def test_what_reaches_outside_is_set_on_the_command_line_only(tmp_path, refusal, command, entry):
+    config, name = tmp_path / "run.toml", entry.split()[0]
+    config.write_text(entry + "\n")
+    words = (tmp_path,) if command == "app" else (tmp_path, "-o", tmp_path / "r.zarr")
+    line = refusal(command, *(words if command != "simulate" else words[1:]), "--config", config)
+    assert f"{config}: expected no '{name}'" in line
+    assert f"--{name} on the command line" in line
+
+
 def test_options_override_the_file(tmp_path):
     config = tmp_path / "s.toml"
     config.write_text(

@@ -12,6 +12,7 @@ from typing import Any, ParamSpec, TypeVar
 from nerif.app.image_files import ImageFiles
 from nerif.app.jobs import Jobs
 from nerif.app.project import OWN, Contents, Project
+from nerif.cli.commands.settings import COMMAND_LINE_ONLY
 from nerif.common.files import write_json
 
 __all__ = ["READ_ONLY", "Workspace"]
@@ -37,10 +38,13 @@ class Workspace:
         return self.project.folder / OWN / "drafts.json"
 
     def draft(self, page: str) -> dict[str, Any]:
-        """Return the entries of a page that differ from the defaults; they survive a reload and a restart."""
+        """Return the entries of a page that differ from the defaults; they survive a reload and a restart.
+
+        The file may come from somebody else: COMMAND_LINE_ONLY survive no restart.
+        """
         if not self._drafts and self._file.is_file():
             try:
-                entries = json.loads(self._file.read_text(encoding="utf-8"))
+                entries = json.loads(self._file.read_text(encoding="utf-8"), object_hook=_harmless)
             except ValueError:  # damaged: only drafts are lost
                 entries = {}
             drafts = entries if isinstance(entries, dict) else {}
@@ -73,3 +77,7 @@ class Workspace:
     async def in_thread(self, work: Callable[P, T], *arguments: P.args, **keywords: P.kwargs) -> T:
         """Run blocking work in a thread, so that pages stay responsive."""
         return await asyncio.to_thread(work, *arguments, **keywords)
+
+
+def _harmless(entries: dict[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in entries.items() if name not in COMMAND_LINE_ONLY}

@@ -36,7 +36,8 @@ class Sequence(Settings):
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Result (.zarr) to write or to continue."""
     cluster: str = "local"
-    """Where to compute: local, tcp://HOST:PORT of a Dask scheduler, or a YAML file for SLURM (docs/sequences.md)."""
+    """Where to compute: local, tcp://HOST:PORT of a Dask scheduler, or a YAML file for SLURM (docs/sequences.md); not
+    from a settings file, since the latter two can run code here."""
     workers: Annotated[int, Ge(0)] = 0
     """Workers of a local cluster (0: one per GPU, or per two cores)."""
     threads: Annotated[int, Ge(0)] = 0

@@ -29,6 +29,7 @@ from nerif.common.files import check_known, local_path, read_toml
 from nerif.common.settings import check_settings
 
 __all__ = [
+    "COMMAND_LINE_ONLY",
     "Flat",
     "Settings",
     "command",
@@ -45,6 +46,9 @@ T = TypeVar("T")
 Flat = tyro.conf.arg(name="")
 """Marks a field whose own fields are options without a prefix."""
 IGNORED_TABLES = ("about",)  # results in run.toml
+COMMAND_LINE_ONLY = ("cluster", "dashboard", "force", "host")
+"""Options that run code of another machine or a shell (cluster), open a port to others, or overwrite files: a file,
+which may come from somebody else, cannot set them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,7 +111,11 @@ def _config(arguments: list[str]) -> Path | None:
 
 
 def _settings_file(path: Path) -> dict[str, Any]:
-    return {k: v for k, v in read_toml(path, "settings file (--config)").items() if k not in IGNORED_TABLES}
+    entries = {k: v for k, v in read_toml(path, "settings file (--config)").items() if k not in IGNORED_TABLES}
+    for name in COMMAND_LINE_ONLY:
+        if name in entries:
+            raise InputError(f"expected no '{name}' in a file; give --{name} on the command line", field=path)
+    return entries
 
 
 def flat_names(cls: type) -> dict[str, tuple[str, ...]]:
