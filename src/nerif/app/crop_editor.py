@@ -211,7 +211,7 @@ class CropEditor:
     def _number(self, key: str, text: str) -> ui.number:
         low = 0 if key in ("row", "column") else 1
         control = ui.number(text, value=0, min=low, step=1, suffix="px").props("outlined dense debounce=250")
-        control.props(f'name="{key}" aria-label="{text} (px)"')
+        control.props["name"], control.props["aria-label"] = key, f"{text} (px)"
 
         async def update() -> None:
             value = control.value

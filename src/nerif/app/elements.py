@@ -21,7 +21,8 @@ __all__ = [
 @contextmanager
 def card(title: str, note: str = "") -> Iterator[ui.element]:
     """Build a framed section with a second-level heading."""
-    with ui.element("section").classes("card").props(f'aria-label="{escape(title)}"') as section:
+    with ui.element("section").classes("card") as section:
+        section.props["aria-label"] = title
         ui.html(f"<h2>{escape(title)}</h2>" + (f"<p class=note>{escape(note)}</p>" if note else ""), sanitize=False)
         yield section
 

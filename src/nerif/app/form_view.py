@@ -78,7 +78,7 @@ class FormView(Generic[T]):
         for name, message in self._messages.items():
             error = self.errors.get(name, "")
             message.set_content(f"<span role=alert>{escape(error)}</span>" if error else "")
-            self._controls[name].props(f"aria-invalid={'true' if error else 'false'}")
+            self._controls[name].props["aria-invalid"] = "true" if error else "false"
             self._controls[name].classes(**{"add" if error else "remove": "wrong"})
 
     # -- controls ------------------------------------------------------------------------------------------------
@@ -101,7 +101,7 @@ class FormView(Generic[T]):
         with ui.element("div").classes("field"):
             control = self._control_of(field, _control_value(field, value))
             label = f"{field.label}{f' ({field.unit})' if field.unit else ''}"
-            control.props(f'name="{field.name}" aria-label="{escape(label)}"')
+            control.props["name"], control.props["aria-label"] = field.name, label
             control.on_value_change(lambda event: self._set_value(field, _record_value(field, event.value)))
             self._controls[field.name] = control
             if field.name in self.sliders:
@@ -113,8 +113,8 @@ class FormView(Generic[T]):
     def _slider(self, field: FormField, control: Any, label: str) -> None:
         """Add a slider of the browser, which has keys and screen reader support."""
         scale = Scale(*self.sliders[field.name], whole=field.kind == "integer")
-        slider = ui.element("input").classes("range")
-        slider.props(f'type=range min=0 max={scale.last} step=1 aria-label="{escape(label)}"')
+        slider = ui.element("input").classes("range").props("type=range min=0 step=1")
+        slider.props["max"], slider.props["aria-label"] = scale.last, label
         position: list[float] = []
 
         def move(event: Any) -> None:
@@ -125,9 +125,9 @@ class FormView(Generic[T]):
             value = control.value
             if not isinstance(value, int | float):
                 return
-            slider.props(f'aria-valuetext="{value:g} {escape(field.unit)}"')
+            slider.props["aria-valuetext"] = f"{value:g} {field.unit}"
             if [value] != position:  # not while the slider is moved
-                slider.props(f"value={scale.step(value)}")
+                slider.props["value"] = scale.step(value)
 
         slider.on("input", move, throttle=0.05, js_handler="(event) => emit(event.target.value)")
         control.on_value_change(follow)
@@ -144,8 +144,7 @@ class FormView(Generic[T]):
         if field.kind in ("number", "integer"):
             control = ui.number(label, value=value, suffix=field.unit or None)
             return control.props('outlined dense debounce=150 step="any"')
-        text = ui.input(label, value=value).props("outlined dense debounce=250")
-        return text.props(f'suffix="{field.unit}"') if field.unit else text
+        return ui.input(label, value=value, suffix=field.unit or None).props("outlined dense debounce=250")
 
     def _set_value(self, field: FormField, value: Any) -> None:
         if self.values.get(field.name, field.default) == value:

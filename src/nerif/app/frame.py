@@ -108,7 +108,7 @@ def _switch(dark: ui.dark_mode) -> None:
 
             def choose(value: bool | None = value) -> None:
                 dark.set_value(value)
-                button.props(f"icon={icons[value]}")
+                button.set_icon(icons[value])
 
             ui.menu_item(name, choose)
 
@@ -140,7 +140,7 @@ class JobsDrawer:
 
     def _on_toggle(self) -> None:
         """Report the state to screen readers, also after a tap beside the drawer."""
-        self.button.props(f"aria-expanded={'true' if self.drawer.value else 'false'}")
+        self.button.props["aria-expanded"] = "true" if self.drawer.value else "false"
 
     def _set(self) -> None:
         with refusals():
@@ -176,7 +176,7 @@ class JobsDrawer:
             if job.state == "refused":
                 text_html(REFUSED, classes="note")
             if job.state == "running" and share:
-                ui.linear_progress(share, show_value=False).props(f'aria-label="{escape(job.title)}"')
+                ui.linear_progress(share, show_value=False).props["aria-label"] = job.title
             with ui.row().classes("gap-1"):
                 for action in ACTIONS[job.state]:
                     if action != "pause" or job.resumable:

@@ -37,8 +37,8 @@ class RangeSlider:
         self.value, self._text, self._label = value, text, label
         with ui.element("div").classes("slider"):
             self._output = ui.html("", sanitize=False).classes("at")
-            self._input = ui.element("input").classes("range")
-            self._input.props(f'type=range min=0 max={max(last, 0)} step=1 value={value} aria-label="{escape(label)}"')
+            self._input = ui.element("input").classes("range").props("type=range min=0 step=1")
+            self._input.props.update({"max": max(last, 0), "value": value, "aria-label": label})
 
         async def move(event: Any) -> None:
             self.value = int(event.args)
@@ -53,13 +53,13 @@ class RangeSlider:
         """Set the step without a call of `on_change`."""
         self.value = value
         self._input.run_method("setAttribute", "value", str(value))
-        self._input.props(f"value={value}")
+        self._input.props["value"] = value
         self._show()
 
     def _show(self) -> None:
         text = self._text(self.value)
         self._output.set_content(f"<span>{escape(self._label)}</span> <b>{escape(text)}</b>")
-        self._input.props(f'aria-valuetext="{escape(text)}"')
+        self._input.props["aria-valuetext"] = text
 
 
 @dataclass(frozen=True)
