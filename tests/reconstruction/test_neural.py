@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -20,7 +22,7 @@ from nerif.reconstruction.base import Reconstruction, Step
 from nerif.reconstruction.files import read_state, write_state
 from nerif.reconstruction.gauge import Gauge
 from nerif.reconstruction.neural import bins, callbacks, objective, trainer
-from nerif.reconstruction.neural.losses import LossWeights, by_differences
+from nerif.reconstruction.neural.losses import LossWeights, MixedPrecision, by_differences
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.neural.presets import PRESETS, preset
 from nerif.reconstruction.neural.training_data import TrainingData
@@ -324,6 +326,34 @@ def test_the_compiled_network_is_the_plain_one():
     """In a process of its own: annotations that check shapes raise inside compiled code."""
     done = subprocess.run([sys.executable, "-W", "ignore", "-c", COMPILED], capture_output=True, text=True)
     assert done.stdout.strip() == "same", done.stderr[-2000:]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="elsewhere every user has a temporary directory")
+@pytest.mark.parametrize("case", ["new", "of another user", "open to others", "a link", "no home", "chosen"])
+def test_compiled_code_is_read_from_a_directory_of_the_user_alone(tmp_path, monkeypatch, case):
+    """It is unpickled; the default of PyTorch is torchinductor_USER in the temporary directory of all users."""
+    cache, others = tmp_path / "nerif" / "torchinductor", tmp_path / "others"
+    others.mkdir()
+    cache.parent.mkdir()
+    monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(others))
+    if case != "chosen":
+        monkeypatch.delenv("TORCHINDUCTOR_CACHE_DIR")
+    monkeypatch.setenv("XDG_CACHE_HOME", "/proc/none" if case == "no home" else str(tmp_path))
+    monkeypatch.setattr(torch, "compile", lambda function, dynamic: function)
+    if case == "of another user":
+        monkeypatch.setattr(os, "geteuid", lambda: 12345)
+    if case == "open to others":
+        cache.mkdir()
+        cache.chmod(0o777)
+    if case == "a link":
+        cache.symlink_to(others)
+    MixedPrecision(Network(NetworkShape(width=8)), torch.device("cpu"), "float32", "on")
+    where = Path(os.environ["TORCHINDUCTOR_CACHE_DIR"])
+    assert (where == cache) == (case == "new")
+    assert (where == others) == (case == "chosen")
+    assert where == others or where.stat().st_mode & 0o077 == 0
+    if where not in (cache, others):
+        where.rmdir()
 
 
 def test_without_a_compiler_the_network_is_not_compiled(measurement, monkeypatch):

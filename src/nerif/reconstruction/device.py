@@ -12,7 +12,9 @@ import functools
 import math
 import os
 import platform
+import stat
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -26,8 +28,8 @@ from nerif.common.conventions import InputError
 from nerif.common.pauses import at_pauses
 
 __all__ = [
-    "Cores", "autocast_dtype", "available_memory", "float32_products", "free_threads", "keep_freed_memory",
-    "on_free_cores", "peak_memory", "resolve_device", "share_threads",
+    "Cores", "autocast_dtype", "available_memory", "float32_products", "free_threads", "keep_compiled_code_private",
+    "keep_freed_memory", "on_free_cores", "peak_memory", "resolve_device", "share_threads",
 ]  # fmt: skip
 
 Parameters = ParamSpec("Parameters")
@@ -51,6 +53,24 @@ def share_threads() -> None:
     threads = torch.get_num_threads()
     numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
     _set(threads)
+
+
+def keep_compiled_code_private() -> None:
+    """Let PyTorch keep compiled code, which it unpickles, where only this user can write, unless a place is set.
+
+    Its default has a fixed name in the temporary directory, where another user may have made it. Triton follows.
+    """
+    if os.name != "posix" or "TORCHINDUCTOR_CACHE_DIR" in os.environ:
+        return
+    home = os.environ.get("XDG_CACHE_HOME", "")
+    try:
+        where = (Path(home) if os.path.isabs(home) else Path.home() / ".cache") / "nerif" / "torchinductor"
+        where.mkdir(0o700, parents=True, exist_ok=True)
+        about = where.lstat()
+        is_private = stat.S_ISDIR(about.st_mode) and about.st_uid == os.geteuid() and not about.st_mode & 0o077
+    except (OSError, RuntimeError):  # no home, or none to write to
+        is_private = False
+    os.environ["TORCHINDUCTOR_CACHE_DIR"] = str(where) if is_private else tempfile.mkdtemp(prefix="nerif-")
 
 
 def free_threads(idle: float, process: float, most: int) -> int:

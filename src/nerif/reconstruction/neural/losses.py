@@ -23,7 +23,7 @@ from nerif.fields.network import Network, NeuralField
 from nerif.forward.base import Weights
 from nerif.forward.path_integral import places
 from nerif.geometry import Rays
-from nerif.reconstruction.device import autocast_dtype, float32_products
+from nerif.reconstruction.device import autocast_dtype, float32_products, keep_compiled_code_private
 from nerif.reconstruction.target import Part
 
 __all__ = ["DATA_TERMS", "Evaluator", "LossWeights", "MixedPrecision", "loss_terms"]
@@ -117,6 +117,7 @@ class MixedPrecision:
 
     def _compiled(self, plain: Evaluation) -> Evaluation:
         """Compiled at the first call; if that fails, as without a C compiler, plain from then on."""
+        keep_compiled_code_private()
         compiled = torch.compile(plain, dynamic=True)
 
         def call(p: Tensor, heads: bool) -> tuple[Tensor, Tensor, Tensor | None]:
