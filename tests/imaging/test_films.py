@@ -48,6 +48,14 @@ def by_ffmpeg(path) -> np.ndarray:
 # --- video
 
 
+@pytest.mark.parametrize("suffix", [".avi", ".mp4", ".mkv"])
+def test_a_script_by_the_name_of_a_film_opens_no_other_file(tmp_path, suffix):
+    write_video(tmp_path / "b.avi", moving(3), "rawvideo", "gray")
+    (tmp_path / f"a{suffix}").write_text("ffconcat version 1.0\nfile b.avi\n")
+    with refused(f"a{suffix}"):
+        open_frames(f"a{suffix}", tmp_path)
+
+
 def write_video(path, images, codec="libx264", pixels="yuv420p", rate=30, options=()) -> None:
     """A film whose brightness has the values of the images (row, column), or whose colours those of R, G, B."""
     options = dict(options)

@@ -15,7 +15,7 @@ import h5py
 import numpy as np
 import pytest
 from imageio import v3
-from PIL import Image
+from PIL import EpsImagePlugin, Image
 
 from imaging_files import (
     packed,
@@ -606,6 +606,17 @@ def test_missing_files(tmp_path, stack8, spec, field, remedy):
     with pytest.raises(InputError, match=remedy) as error:
         open_frames(spec, tmp_path)
     assert error.value.field == field
+
+
+@pytest.mark.parametrize("suffix", [".png", ".bmp", ".jpg", ".tif"])
+def test_a_drawing_by_the_name_of_an_image_starts_no_ghostscript(tmp_path, monkeypatch, suffix):
+    Image.new("L", (10, 7)).save(tmp_path / "a.eps")
+    (tmp_path / "a.eps").rename(tmp_path / f"a{suffix}")
+    starts = []
+    monkeypatch.setattr(EpsImagePlugin, "Ghostscript", lambda *_, **__: starts.append(1) or Image.new("L", (10, 7)))
+    with refused(f"a{suffix}"):
+        open_frames(f"a{suffix}", tmp_path)[0]
+    assert not starts
 
 
 @pytest.mark.parametrize("suffix", [".png", ".bmp", ".jpg", ".tif"])

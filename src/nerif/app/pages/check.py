@@ -115,7 +115,7 @@ class CheckPage:
         self.outlines.clear()
         self.outline_card.set_visibility(figure.is_file())
         if figure.is_file():
-            with self.outlines, Image.open(figure) as image:
+            with self.outlines, Image.open(figure, formats=("PNG",)) as image:
                 ui.image(image.copy()).props('alt="Outlines of the model in each view"')
 
     def _record(self) -> Check:

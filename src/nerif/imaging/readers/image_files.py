@@ -282,7 +282,7 @@ def _significant_bits(chunks: dict[bytes, bytes]) -> int | None:
 
 
 class Image(ImageFile):
-    """An image that Pillow reads: BMP, JPEG."""
+    """An image that Pillow reads: BMP, JPEG; of others by such a name, EPS would start Ghostscript."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -290,7 +290,7 @@ class Image(ImageFile):
     def read(self, i: int) -> np.ndarray:
         from PIL import Image as Pillow
 
-        with Pillow.open(self._path) as image:
+        with Pillow.open(self._path, formats=("BMP", "JPEG")) as image:
             palette = image.palette if image.mode == "P" else None
             return np.array(image if palette is None else image.convert(palette.mode))
 

@@ -17,6 +17,8 @@ from nerif.imaging.readers.frames import Frames
 __all__ = ["VideoFrames"]
 
 LOSSY, LOSSLESS, REORDERED = 2, 4, 8  # properties of a codec; some have both of the first two
+CONTAINERS = {"format_whitelist": "avi,mov,matroska", "protocol_whitelist": "file"}
+"""For FFmpeg, which also reads scripts and playlists that name other files and addresses."""
 LIMITED_RANGE, FULL_RANGE = 1, 2
 LIMITED_WHITE = 235  # of 8 bit; black is 16 (ITU-R BT.601)
 
@@ -39,7 +41,7 @@ class VideoFrames(Frames):
         self._lock = threading.Lock()  # of the decoder
         av = _av()
         try:
-            with av.open(f"file:{path}", metadata_errors="replace") as film:
+            with av.open(f"file:{path}", metadata_errors="replace", options=CONTAINERS) as film:
                 stream: Any = next(iter(film.streams.video), None)
                 context = stream and stream.codec_context
                 if context is None or not context.pix_fmt:
@@ -149,7 +151,7 @@ class VideoFrames(Frames):
         """Set the decoder to a key frame."""
         if self._film is not None:
             self._film.close()
-        self._film = _av().open(f"file:{self._path}", metadata_errors="replace")
+        self._film = _av().open(f"file:{self._path}", metadata_errors="replace", options=CONTAINERS)
         stream = self._film.streams.video[0]
         if key:
             next(self._film.decode(stream))  # has the palette of all frames, if there is one
