@@ -90,6 +90,12 @@ def test_the_command_line_gives_the_same_record(values):
     assert parse(Design(), words[1:], "nerif design", "") == FORM.build(values)
 
 
+def test_no_text_of_a_form_is_an_option():
+    form = form_of("nerif", "fast")
+    words = form.arguments({"withhold": ["--config=x.toml", "-ox"], "upper": -3.0, "start_from": "--force"})
+    assert [word for word in words if word.startswith("-")] == ["--withhold", "--start-from", "--upper", "-3"]
+
+
 def test_the_command_line_of_nested_fields_and_switches_gives_the_same_record():
     form = form_of("nerif", "fast")
     values = {"report": False, "network.gradient_head": True, "weights.head": 0.5, "withhold": ["0deg", "20deg"]}

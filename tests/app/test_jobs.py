@@ -15,9 +15,9 @@ import pytest
 from nerif.app import runner
 from nerif.app.jobs import Job, Jobs, claim
 from nerif.app.result_volumes import film_progress
-from nerif.cli.arguments import command_line
 from nerif.cli.cli import main
 from nerif.common.files import write_json
+from nerif.common.installation import command_line
 from refusals import refused
 
 HELP = ("--version",)

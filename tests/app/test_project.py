@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from contextlib import chdir
 
 import pytest
 
@@ -37,6 +38,23 @@ def test_links_that_lead_outside_are_refused(folder):
         project.path("out/secret")
     assert project.path("in/new.nc") == folder / "new.nc"
     assert project.relative(folder / "in" / "a b.nc") == "a b.nc"
+
+
+def test_no_name_in_a_folder_is_an_option(folder, capsys):
+    (folder / "--out=..").mkdir()
+    (folder / "--out=.." / "run.toml").write_text("")
+    (folder / "--config=x.nc").write_bytes(b"CDF no")
+    (folder / "-ox.toml").write_text('format = "nerif-calibration-1"\n')
+    project = Project(folder)
+    contents = project.contents()
+    assert contents.measurements == ("./--config=x.nc",)
+    assert contents.calibrations == ("./-ox.toml",)
+    assert contents.results == ("./--out=..",)
+    assert project.relative(folder / "--config=x.nc") == "./--config=x.nc"
+    assert project.path("./--config=x.nc") == folder / "--config=x.nc"
+    with chdir(folder):
+        assert main(["info", *contents.measurements]) == 2
+    assert "x.nc" in capsys.readouterr().err.partition(":")[2]
 
 
 def test_what_is_in_a_folder(folder):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +27,7 @@ from nerif.fields.network import NetworkShape
 from nerif.geometry import Grid
 from nerif.imaging.calibration.cameras_file import FORMAT
 from nerif.imaging.readers.views import find_views
+from nerif.reconstruction.files import CHECKPOINT
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.results.directory import ResultDirectory
 from nerif.workflow.sequence.store import SequenceStore
@@ -106,6 +109,18 @@ def test_a_command_names_the_kind_that_it_got(folder, monkeypatch, refusal, comm
             assert line.startswith(f"nerif: {name}: expected "), line
             assert line.endswith(f", got {kind.name}; {use}\n"), line
     assert sorted(folder.rglob("*")) == before
+
+
+def test_a_command_to_copy_contains_no_command_of_a_name(folder, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name, word in (("$(x); x.nc", "'$(x); x.nc'"), ("--force.nc", "./--force.nc")):
+        shutil.copy(folder / "m.nc", name)
+        with pytest.raises(InputError, match=re.escape(f"nerif reconstruct {word} -o RESULT")):
+            check_kind(name, kinds.RESULT)
+    folder = tmp_path / "-o `x`"
+    ResultDirectory(folder).begin({})
+    (folder / CHECKPOINT).touch()
+    assert "nerif reconstruct --resume -o './-o `x`'." in ResultDirectory("-o `x`").read().missing[0].sentence
 
 
 @pytest.mark.parametrize("command", COMMANDS)

@@ -18,10 +18,10 @@ import pytest
 import torch
 
 import nerif
-from nerif.cli import arguments, cli
-from nerif.cli.arguments import command_line
+from nerif.cli import cli
 from nerif.cli.closed_output import is_closed_output
-from nerif.common import files
+from nerif.common import files, installation
+from nerif.common.installation import command_line
 from nerif.common.interruption import interrupt
 from nerif.imaging.masks import MaskShape, write_masks
 from nerif.reconstruction.base import State
@@ -219,5 +219,5 @@ def test_ctrl_break_stops_a_run_as_ctrl_c_does(tmp_path: Path, monkeypatch: pyte
 
 
 def test_command_lines_are_quoted_for_the_shell_of_windows(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(arguments, "WINDOWS", True)
+    monkeypatch.setattr(installation, "WINDOWS", True)
     assert command_line(["info", r"C:\data\m.nc", "a b.nc"]) == r'nerif info C:\data\m.nc "a b.nc"'

@@ -37,6 +37,7 @@ from nerif.analysis.consistency import (
 )
 from nerif.common.conventions import InputError
 from nerif.common.findings import Finding
+from nerif.common.installation import quoted, word_of
 from nerif.data.measurement import MASKS, Measurement, integrals_of
 from nerif.reconstruction.aperture import apply_aperture
 from nerif.reconstruction.device import on_free_cores
@@ -320,7 +321,8 @@ def late_views(shifts: Sequence[Shift], frame_offsets: Mapping[str, int]) -> lis
         if any(shift.at_end for shift in shifts if shift.name in views):
             films += ", or more, as the film is too short for larger offsets: measure more frames to be sure"
         gains = ", ".join(f"{shift.gain:.0f}" for shift in shifts if shift.name in views)
-        options = " ".join(f"--frame-offset {name} {frame_offsets.get(name, 0) + late}" for name in views)
+        offsets = {quoted(word_of(name)): frame_offsets.get(name, 0) + late for name in views}
+        options = " ".join(f"--frame-offset {name} {frames}" for name, frames in offsets.items())
         subject = Finding.subject(views, len(shifts))
         sentence = f"{subject}: {films} (gain of evidence {gains}; {MIN_GAIN:g} is clear): nerif displacement {options}"
         findings.append(Finding("late", sentence, views))

@@ -307,5 +307,5 @@ class Blink:
         """Show two images by their addresses."""
         for image, address, source in zip(self._images, (reference, flow), SOURCES, strict=True):
             image.props["src"] = address
-            image.props["alt"] = f"{source.capitalize()} of {escape(self._name)}"
+            image.props["alt"] = f"{source.capitalize()} of {self._name}"
             image.update()

@@ -9,8 +9,8 @@ from typing import Any
 
 from nicegui import ui
 
-from nerif.cli.arguments import command_line, quoted
 from nerif.common.conventions import InputError
+from nerif.common.installation import command_line, quoted
 
 __all__ = [
     "CommandLine", "FileChoice", "card", "dialog", "figures", "images_html", "items_html", "refusals", "select",

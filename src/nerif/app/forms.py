@@ -18,6 +18,7 @@ import tyro
 
 from nerif.cli.commands.settings import flat_names, help_of, merge
 from nerif.common.conventions import InputError
+from nerif.common.installation import word_of
 
 __all__ = ["Form", "FormField"]
 
@@ -67,7 +68,7 @@ class FormField:
             group, dot, last = self.flag[2:].rpartition(".")
             return [self.flag if value else f"--{group}{dot}no-{last}"]
         values = value if isinstance(value, list | tuple) else [value]
-        return [self.flag, *("None" if v is None else f"{v:g}" if _whole(v) else str(v) for v in values)]
+        return [self.flag, *("None" if v is None else f"{v:g}" if _whole(v) else word_of(v) for v in values)]
 
 
 class Form(Generic[T]):

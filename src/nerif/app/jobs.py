@@ -34,13 +34,13 @@ from typing import Any
 from nerif.app.private import secret
 from nerif.app.project import OWN
 from nerif.app.runner import ENDED, JOB, LOG, STARTED
-from nerif.cli.arguments import command_line
 from nerif.common.conventions import InputError
 from nerif.common.files import write_json
+from nerif.common.installation import command_line
 from nerif.common.interruption import interrupt
 from nerif.results.directory import RUN
 
-__all__ = ["REFUSED", "Job", "Jobs", "command_line"]
+__all__ = ["REFUSED", "Job", "Jobs"]
 
 WAITING, OWNER = "waiting", "runner-"
 CLOCK = 1.5  # tolerance of the start time of a process, s

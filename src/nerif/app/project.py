@@ -10,6 +10,7 @@ from typing import TypeVar
 
 from nerif.common.conventions import InputError
 from nerif.common.files import ending
+from nerif.common.installation import word_of
 from nerif.data.body_file import FORMATS
 from nerif.data.kinds import VOLUME, kind_of
 from nerif.imaging.readers.views import View, find_views
@@ -26,7 +27,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Contents:
-    """Files of a project as paths relative to its folder, sorted.
+    """Files of a project as paths relative to its folder, as a command takes them, sorted.
 
     Parameters
     ----------
@@ -90,7 +91,7 @@ class Project:
 
     def relative(self, path: str | os.PathLike[str]) -> str:
         """Return a path relative to the folder, as the command line takes it."""
-        return self.path(path).relative_to(self.folder).as_posix()
+        return word_of(self.path(path).relative_to(self.folder).as_posix())
 
     def free_name(self, stem: str, reserved: Collection[str] = ()) -> str:
         """Return the first of stem, stem-2, stem-3, ... that neither exists nor is in `reserved`."""
@@ -117,7 +118,7 @@ class Project:
         names: dict[str, list[str]] = {name: [] for name in Contents.__dataclass_fields__ if name != "unread"}
         unread: list[tuple[str, str]] = []
         for path in self._walk(self.folder, DEPTH, [0], unread):
-            name = path.relative_to(self.folder).as_posix()
+            name = word_of(path.relative_to(self.folder).as_posix())
             try:
                 if not path.resolve().is_relative_to(self.folder):
                     continue

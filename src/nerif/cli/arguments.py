@@ -10,17 +10,14 @@ import itertools
 import json
 import os
 import re
-import shlex
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 from nerif.common.conventions import InputError
-from nerif.common.files import WINDOWS, ending
+from nerif.common.files import ending
 
-__all__ = [
-    "ALIASES", "INPUTS", "check_arguments", "check_output", "command_line", "flag_value", "quoted", "table", "words_of",
-]  # fmt: skip
+__all__ = ["ALIASES", "INPUTS", "check_arguments", "check_output", "flag_value", "table", "words_of"]
 
 MEASUREMENT = "no such file; expected a measurement (NetCDF-4, BOST-1.1)"
 RESULT = "no such directory; expected one written by nerif reconstruct"
@@ -160,20 +157,6 @@ def check_output(path: Path, force: bool, *others: Path, endings: tuple[str, ...
             raise InputError("expected the name of a file, got a folder", field=file)
         if file.exists() and not force:
             raise InputError("exists already and was left as it is; give another --out, or --force", field=file)
-
-
-def command_line(arguments: Sequence[str]) -> str:
-    """Return the command line of the arguments of nerif."""
-    return " ".join(map(quoted, ("nerif", *arguments)))
-
-
-def quoted(word: str) -> str:
-    """Return a word as the shell of this system reads it."""
-    if not WINDOWS:
-        return shlex.quote(word)
-    from subprocess import list2cmdline
-
-    return list2cmdline([word])
 
 
 def table() -> dict[str, dict[str, Any]]:

@@ -1,17 +1,44 @@
-"""The distribution name of this program; `nerif` on PyPI belongs to another project."""
+"""The distribution name of this program (`nerif` on PyPI belongs to another project), and its commands to copy."""
 
 from __future__ import annotations
 
-__all__ = ["DISTRIBUTION", "install", "stranger"]
+import re
+import shlex
+from collections.abc import Sequence
+
+from nerif.common.files import WINDOWS
+
+__all__ = ["DISTRIBUTION", "command_line", "install", "quoted", "stranger", "word_of"]
 
 DISTRIBUTION = "nerif-bost"
 COMMAND = "nerif.cli.cli:main"
 """Entry point of this program's command `nerif`."""
+OPTION = re.compile(r"-(?![\d.])")
+"""Beginning of a word that a command takes for an option, not for a number."""
 
 
 def install(extra: str) -> str:
     """Return the command that installs an extra of pyproject.toml."""
     return f"pip install '{DISTRIBUTION}[{extra}]'"
+
+
+def word_of(name: object) -> str:
+    """Return the name of a file as an argument of a command, so that none is taken for an option."""
+    return f"./{name}" if OPTION.match(str(name)) else str(name)
+
+
+def command_line(arguments: Sequence[str]) -> str:
+    """Return the command line of the arguments of nerif."""
+    return " ".join(map(quoted, ("nerif", *arguments)))
+
+
+def quoted(word: str) -> str:
+    """Return a word as the shell of this system reads it."""
+    if not WINDOWS:
+        return shlex.quote(word)
+    from subprocess import list2cmdline
+
+    return list2cmdline([word])
 
 
 def stranger() -> str:

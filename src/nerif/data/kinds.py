@@ -16,6 +16,7 @@ from nerif.common.conventions import InputError
 from nerif.common.files import ending
 from nerif.common.image_names import ARRAYS as NUMPY_AND_HDF5
 from nerif.common.image_names import FOLDER_SUFFIXES, SOURCES, SUFFIXES
+from nerif.common.installation import quoted, word_of
 from nerif.common.netcdf import opened
 from nerif.forward.registry import TECHNIQUES
 
@@ -103,7 +104,7 @@ def check_kind(path: str | os.PathLike[str], *wanted: Kind, ignore: tuple[Kind, 
     """
     kind, path = kind_of(path), Path(path)
     if kind is not None and kind not in (*wanted, *ignore):
-        use = kind.use.format(path=path, parent=path.parent)
+        use = kind.use.format(path=quoted(word_of(path)), parent=quoted(word_of(path.parent)))
         *names, last = (k.name for k in wanted)
         expected = f"{', '.join(names)} or {last}" if names else last
         raise InputError(f"expected {expected}, got {kind.name}; {use}", field=path)

@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 from nerif import __version__
 from nerif.common.conventions import InputError
 from nerif.common.files import atomic, read_toml, write_toml
+from nerif.common.installation import command_line, word_of
 from nerif.common.written_files import WARN, OwnFiles, remove_empty
 from nerif.data.exports import export
 from nerif.data.kinds import RESULT, RUN, check_kind
@@ -257,7 +258,8 @@ class ResultDirectory:
         """Return metrics.json."""
         path = self.path / METRICS
         if not self.has(METRICS):
-            raise InputError(f"missing; nerif evaluate {self.path} --measurement FILE writes it", field=path)
+            words = ["evaluate", word_of(self.path), "--measurement", "FILE"]
+            raise InputError(f"missing; {command_line(words)} writes it", field=path)
         return Metrics.read(path)
 
     def history(self) -> list[dict[str, float]]:
@@ -340,7 +342,7 @@ class ResultDirectory:
         if not finished:
             remedy = "Start it again"
             if self.has(CHECKPOINT):
-                remedy = f"Continue with nerif reconstruct --resume -o {self.path}"
+                remedy = f"Continue with {command_line(['reconstruct', '--resume', '-o', word_of(self.path)])}"
             rest = f" Not written yet: {', '.join(pending)}." if pending else ""
             gaps.insert(0, Gap(FIELD, f"The run has not ended: there is no {FIELD}. {remedy}.{rest}"))
         return Result(

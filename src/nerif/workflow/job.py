@@ -14,6 +14,7 @@ from nerif.analysis.asymmetry import halved
 from nerif.analysis.gains import fit_gains, with_gains
 from nerif.analysis.prediction import check_sees
 from nerif.common.conventions import InputError
+from nerif.common.installation import command_line, word_of
 from nerif.common.settings import NonNegative, check_settings
 from nerif.data.measurement import Measurement
 from nerif.data.volume import Volume, quantities_of
@@ -78,7 +79,7 @@ class Run:
 
 def remedy(out: ResultDirectory, own_files: bool) -> str:
     """Return what an interrupted run (with own files in the directory or not) has saved, and how to continue."""
-    resume = f"nerif reconstruct --resume --out {out.path}"
+    resume = command_line(["reconstruct", "--resume", "--out", word_of(out.path)])
     if own_files and out.has(FIELD):
         return f"{out.path} holds the field, but not all other files; complete it with {resume}"
     if own_files and (out.has(CHECKPOINT) or out.cross_validation.has(CHECKPOINT) or out.cross_validation.has(FIELD)):

@@ -22,6 +22,7 @@ from nerif.cli.commands.calibrate import Calibrate
 from nerif.cli.commands.settings import merge
 from nerif.common.conventions import InputError
 from nerif.common.files import read_toml
+from nerif.common.installation import word_of
 from nerif.imaging.calibration.result import ImageError
 from nerif.imaging.calibration.simple_rig import SimpleRig
 from nerif.imaging.calibration.targets import CalibrationTarget
@@ -143,11 +144,12 @@ class CalibrationPage:
 
     def arguments(self) -> list[str]:
         """Return the arguments of nerif that the page is set to."""
-        words = ["calibrate", self.experiment.value or "FOLDER", "-o", self.out.value or "NAME.toml"]
+        words = ["calibrate", self.experiment.value or "FOLDER", "-o", word_of(self.out.value or "NAME.toml")]
         words += ["--config", self.settings] if self.settings else []
         words += ["--simple"] if self.simple else []
         words += self.form.arguments
-        words += ["--leave-out", *self.excluded_images] if self.excluded_images and not self.simple else []
+        exclusions = [] if self.simple else map(word_of, self.excluded_images)
+        words += ["--leave-out", *exclusions] if self.excluded_images and not self.simple else []
         return [*words, "--force"] if self._exists() else words
 
     def _exists(self) -> bool:

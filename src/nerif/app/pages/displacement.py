@@ -17,6 +17,7 @@ from nerif.app.project import Contents
 from nerif.app.view_maps import maps_html
 from nerif.app.workspace import Workspace
 from nerif.cli.commands.displacement import Displacement
+from nerif.common.installation import word_of
 from nerif.data.measurement import Measurement
 from nerif.imaging.recording import measure_instant
 
@@ -81,7 +82,7 @@ class DisplacementPage:
     def _words(self) -> list[str]:
         return [
             "displacement", str(self.experiment.value), "--calibration", str(self.calibration.value),
-            "--out", str(self.out.value),
+            "--out", word_of(self.out.value),
         ]  # fmt: skip
 
     def _on_choice(self) -> None:

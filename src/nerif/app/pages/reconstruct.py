@@ -21,6 +21,7 @@ from nerif.cli.commands.reconstruct import Reconstruct, command_of
 from nerif.cli.commands.sequence import Sequence
 from nerif.common.conventions import InputError
 from nerif.common.files import ending
+from nerif.common.installation import word_of
 from nerif.data.measurement_sequence import MeasurementSequence
 from nerif.reconstruction.methods import METHODS
 from nerif.reconstruction.neural.presets import PRESETS, preset
@@ -122,7 +123,7 @@ class ReconstructPage:
     def arguments(self) -> list[str]:
         """Return the arguments of nerif that the page is set to."""
         verb = "sequence" if self.film else "reconstruct"
-        words = [verb, self.measurement.name or "MEASUREMENT.nc", "--out", self.out.value or "OUT"]
+        words = [verb, self.measurement.name or "MEASUREMENT.nc", "--out", word_of(self.out.value or "OUT")]
         if not self.film and self.method.value != "nerif":
             words += ["--method", self.method.value]
         elif self.preset.value != "auto":

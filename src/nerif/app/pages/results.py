@@ -21,7 +21,7 @@ from nerif.app.workspace import Workspace
 from nerif.cli.commands.export import Export
 from nerif.cli.commands.figures import Figures
 from nerif.cli.commands.movie import MovieCommand
-from nerif.common.installation import install
+from nerif.common.installation import install, word_of
 from nerif.data.exports import FORMATS
 
 __all__ = ["PAGE"]
@@ -167,8 +167,9 @@ class ResultsPage:
             name = ui.input("File to write", value=name_with(first)).props("outlined dense debounce=250")
             name.props["aria-label"] = "File to write"
             job_form = JobForm(
-                self.work, f"{PAGE.name}.{verb}", form, lambda: [verb, self.row.name, "-o", name.value or "FILE"],
-                button, main, lambda: name.value, subject=self.row.name,
+                self.work, f"{PAGE.name}.{verb}", form,
+                lambda: [verb, self.row.name, "-o", word_of(name.value or "FILE")], button, main, lambda: name.value,
+                subject=self.row.name,
             )  # fmt: skip
         choice.on_value_change(lambda: name.set_value(name_with(choice.value)))
         name.on_value_change(job_form.show)

@@ -12,11 +12,10 @@ from typing import Annotated, Literal
 import tyro
 from annotated_types import Ge
 
-from nerif.cli.arguments import command_line
 from nerif.cli.commands.output import say
 from nerif.cli.commands.settings import Settings, command
 from nerif.common.conventions import InputError
-from nerif.common.installation import install
+from nerif.common.installation import command_line, install
 from nerif.common.written_files import OwnFiles
 from nerif.data.samples import SAMPLES, sample
 from nerif.results.directory import REPORT, ResultDirectory

@@ -12,6 +12,7 @@ import tyro
 from nerif.cli.commands.output import counting_bar, say
 from nerif.cli.commands.settings import Flat, Settings, command
 from nerif.common.conventions import AMBIENT_INDEX
+from nerif.common.installation import command_line, word_of
 from nerif.common.interruption import if_interrupted
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Ring
@@ -65,7 +66,8 @@ def run(settings: Render) -> None:
         )  # fmt: skip
     say(f"{settings.out}: images of {len(cameras)} views, {images.sensor.bits} bit")
     say(f"target: {images.target_for(cameras).label}")
-    say(f"next: nerif calibrate {settings.out} --config {settings.out / 'calibrate.toml'} -o calibration.toml")
+    words = ["calibrate", word_of(settings.out), "--config", word_of(settings.out / "calibrate.toml")]
+    say(f"next: {command_line([*words, '-o', 'calibration.toml'])}")
 
 
 main = command("render", Render, run)
