@@ -178,6 +178,19 @@ def test_the_command_imports_nothing_of_a_folder_nor_do_its_workers(tmp_path):
     assert not (folder / "mark").exists()
 
 
+def test_matplotlib_obeys_the_file_in_the_home_of_the_user_and_none_of_a_folder(tmp_path, monkeypatch):
+    home, folder = tmp_path / "home" / "matplotlib", tmp_path / "project"
+    home.mkdir(parents=True)
+    folder.mkdir()
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(home.parent))
+    monkeypatch.delenv("MPLCONFIGDIR", raising=False)
+    (home / "matplotlibrc").write_text("lines.linewidth: 7\n")
+    (folder / "matplotlibrc").write_text("text.usetex: True\ntext.latex.preamble: \\input{/etc/passwd}\n")
+    code = "from nerif.cli.cli import main; main(); import matplotlib as m, os; print(os.getcwd());"
+    done = run(["-c", code + "print([m.rcParams[n] for n in ('text.usetex', 'lines.linewidth')])", "--version"], folder)
+    assert done.stdout.splitlines()[1:] == [str(folder), "[False, 7.0]"], done.stderr
+
+
 def test_python_m_nerif_imports_no_package_of_a_folder(tmp_path):
     plant(tmp_path, ("numpy", "psutil", "torch"))
     done = run(["-m", "nerif", "info", "m.nc"], tmp_path)

@@ -6,6 +6,7 @@ import importlib
 import io
 import os
 import sys
+from contextlib import chdir
 
 from nerif import __version__
 
@@ -49,7 +50,7 @@ def main(arguments: list[str] | None = None) -> int:
             if isinstance(stream, io.TextIOWrapper) and stream.encoding.lower() not in ("utf-8", "utf8"):
                 stream.reconfigure(errors="replace")  # a console without Greek letters shows question marks
         if arguments is None:
-            _ignore_code_in_the_current_folder()
+            _obey_nothing_in_the_current_folder()
             _let_ctrl_break_interrupt()
             arguments = sys.argv[1:]
         code = _run(list(arguments))
@@ -64,14 +65,18 @@ def main(arguments: list[str] | None = None) -> int:
     return code
 
 
-def _ignore_code_in_the_current_folder() -> None:
-    """Keep Python and Numba, here and in child processes, from executing files of the current folder.
+def _obey_nothing_in_the_current_folder() -> None:
+    """Keep Python and Numba, here and in child processes, and Matplotlib from obeying files of the current folder.
 
     Python started with -c or -m, as workers are, imports from it. Numba reads the place of its compiled code, which is
-    pickled, from .numba_config.yaml in it.
+    pickled, from .numba_config.yaml in it; Matplotlib, when it is imported, whether LaTeX writes the texts, from
+    matplotlibrc in it, before the file in the user's home.
     """
     os.environ["PYTHONSAFEPATH"] = "1"
     os.environ.setdefault("NUMBA_CACHE_DIR", "")
+    if os.path.lexists("matplotlibrc"):
+        with chdir(os.path.dirname(os.path.abspath(__file__))):
+            import matplotlib  # noqa: F401
 
 
 def _let_ctrl_break_interrupt() -> None:
