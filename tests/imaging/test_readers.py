@@ -29,6 +29,8 @@ from imaging_files import (
     write_tiff,
 )  # fmt: skip
 from nerif.common.conventions import InputError
+from nerif.data.volume_file import read_volume
+from nerif.imaging.calibration.importers.matlab import read_matlab
 from nerif.imaging.readers import image_files
 from nerif.imaging.readers.crop import Crop
 from nerif.imaging.readers.frames import Frames, read_each
@@ -617,6 +619,28 @@ def test_a_drawing_by_the_name_of_an_image_starts_no_ghostscript(tmp_path, monke
     with refused(f"a{suffix}"):
         open_frames(f"a{suffix}", tmp_path)[0]
     assert not starts
+
+
+@pytest.mark.parametrize("kind", ["storage", "link", "virtual"])
+@pytest.mark.parametrize(("name", "read"), [("a.h5", open_frames), ("a.nc", read_volume), ("a.mat", read_matlab)])
+def test_a_part_of_another_file_is_not_read(tmp_path, kind, name, read):
+    (tmp_path / "outside").mkdir()
+    other = tmp_path / "outside" / "secret"
+    other.write_bytes(bytes(range(70)))
+    with h5py.File(tmp_path / "outside" / "x.h5", "w") as file:
+        file["x"] = np.zeros((H, W), np.uint8)
+    with h5py.File(tmp_path / name, "w") as file:
+        group = file.create_group("group")
+        if kind == "storage":
+            group.create_dataset("x", (H, W), np.uint8, external=[(str(other), 0, h5py.h5f.UNLIMITED)])
+        elif kind == "link":
+            group["x"] = h5py.ExternalLink("outside/x.h5", "x")
+        else:
+            layout = h5py.VirtualLayout((H, W), np.uint8)
+            layout[:] = h5py.VirtualSource(tmp_path / "outside" / "x.h5", "x", (H, W))
+            group.create_virtual_dataset("x", layout)
+    with pytest.raises(InputError, match=r"'(group/)?x' is in another file; copy it into this one"):
+        read(tmp_path / name)
 
 
 @pytest.mark.parametrize("suffix", [".png", ".bmp", ".jpg", ".tif"])

@@ -14,7 +14,7 @@ from nerif.common.installation import word_of
 from nerif.data.body_file import FORMATS
 from nerif.data.kinds import VOLUME, kind_of
 from nerif.imaging.readers.views import View, find_views
-from nerif.results.directory import LIVE, RUN
+from nerif.results.directory import LIVE, RUN, check_links
 
 __all__ = ["OWN", "Contents", "Project"]
 
@@ -159,7 +159,10 @@ class Project:
         if path.is_dir():
             if ending(path) == ".zarr":
                 return "films"
-            return "results" if _is_result(path) else "experiments" if _has_views(path) else ""
+            if _is_result(path):
+                check_links(path)
+                return "results"
+            return "experiments" if _has_views(path) else ""
         if ending(path) in FORMATS:
             return "models"
         if ending(path) == ".toml":

@@ -18,8 +18,8 @@ from typing import Any
 from nerif.common.conventions import InputError
 
 __all__ = [
-    "WINDOWS", "atomic", "check_known", "ending", "is_file_name", "local_path", "read_toml", "write_json", "write_toml",
-    "written",
+    "WINDOWS", "atomic", "check_known", "ending", "is_file_name", "is_near", "local_path", "read_toml", "recorded",
+    "write_json", "write_toml", "written",
 ]  # fmt: skip
 
 WINDOWS = os.name == "nt"
@@ -55,6 +55,26 @@ def local_path(path: str | os.PathLike[str], base: Path, field: object) -> Path:
             field=field,
         )
     return Path(text.replace("\\", "/"))
+
+
+def is_near(path: str | os.PathLike[str], holder: Path) -> bool:
+    """Return whether a path lies in the current folder or in that of `holder`, by its text and by its links."""
+    places, texts = (Path.cwd(), holder.resolve().parent), (os.path.abspath, os.path.realpath)
+    return any(all(Path(text(path)).is_relative_to(place) for text in texts) for place in places)
+
+
+def recorded(path: str | os.PathLike[str], holder: Path) -> Path:
+    """Return the path of a file that a result, the holder, names; InputError if it is not near.
+
+    A result may come from somebody else, and its report would show the content of any file.
+    """
+    if not is_near(path, holder):
+        raise InputError(
+            f"outside of the current folder and of that of {holder}, which names it; start the command in a folder "
+            "that contains it, or copy it beside",
+            field=path,
+        )
+    return Path(path)
 
 
 def is_file_name(name: str) -> bool:

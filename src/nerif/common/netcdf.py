@@ -18,6 +18,7 @@ import numpy as np
 from nerif.common.conventions import InputError
 
 if TYPE_CHECKING:
+    import h5py
     import xarray as xr
 
 CLASSIC, WIDE = (b"CDF\x01", b"CDF\x02"), b"CDF\x05"
@@ -25,7 +26,7 @@ CLASSIC, WIDE = (b"CDF\x01", b"CDF\x02"), b"CDF\x05"
 HEAP = b"GCOL\x01\0\0\0"
 """Signature and version of a global heap of HDF5."""
 
-__all__ = ["opened", "reading", "values"]
+__all__ = ["check_in_one_file", "opened", "reading", "values"]
 
 
 @contextmanager
@@ -62,6 +63,7 @@ def _dataset(path: Path) -> xr.Dataset:
         raise InputError(f"expected NetCDF-4 or classic, got NetCDF-3 with 64-bit data; convert: {remedy}", field=path)
     check_heaps(path)
     with h5py.File(path, "r") as file:
+        check_in_one_file(file)
         file.attrs.get("_nc3_strict")  # where this fails, h5netcdf leaves a half-made object that complains later
     return xr.open_dataset(path, engine="h5netcdf", decode_times=False)
 
@@ -86,6 +88,22 @@ def reading(message: str) -> Iterator[None]:
     except Exception as error:  # libraries raise anything on damaged files
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(f"{message} ({reason})") from None
+
+
+def check_in_one_file(file: h5py.File) -> None:
+    """Raise OSError if a part of an HDF5 file, which may come from somebody else, is in another file."""
+    import h5py
+
+    def check(name: str, item: h5py.Group | h5py.Dataset) -> None:
+        if isinstance(item, h5py.Dataset):
+            names = [name] if item.external or item.is_virtual else []
+        else:
+            names = [key for key in item if isinstance(item.get(key, getlink=True), h5py.ExternalLink)]
+        if names:
+            raise OSError(f"'{names[0]}' is in another file; copy it into this one, as by h5repack")
+
+    check("/", file)
+    file.visititems(check)
 
 
 def check_heaps(path: Path) -> None:

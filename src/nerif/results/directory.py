@@ -14,9 +14,9 @@ from typing import Any, TypeVar
 
 from nerif import __version__
 from nerif.common.conventions import InputError
-from nerif.common.files import atomic, read_toml, write_toml
+from nerif.common.files import atomic, is_near, read_toml, recorded, write_toml
 from nerif.common.installation import command_line, word_of
-from nerif.common.written_files import WARN, OwnFiles, remove_empty
+from nerif.common.written_files import WARN, WRITTEN, OwnFiles, remove_empty
 from nerif.data.exports import export
 from nerif.data.kinds import RESULT, RUN, check_kind
 from nerif.data.measurement import Measurement
@@ -37,7 +37,7 @@ from nerif.results.metrics import Metrics
 
 __all__ = [
     "CALIBRATION", "FIGURES", "METRICS", "REPORT", "RUN", "SURFACE", "VOLUME", "Gap", "Result", "ResultDirectory",
-    "versions",
+    "check_links", "versions",
 ]  # fmt: skip
 
 METRICS, HISTORY, REPORT = "metrics.json", "history.csv", "report.html"
@@ -116,18 +116,27 @@ class Result:
         return METHODS[method].title if method in METHODS else method
 
 
+def check_links(directory: Path) -> None:
+    """Raise an InputError if a link of a result, which may come from somebody else, leads out of its directory."""
+    names = (*FILES, *MERIDIAN, *SURFACE, LIVE, LIVE_FIELD, WRITTEN, "tensorboard", CROSS_VALIDATION, FIGURES, TRIALS)
+    for path in (*(directory / name for name in names), *(directory / TRIALS).glob("[0-9]*")):
+        if path.is_symlink() and not path.resolve().is_relative_to(directory.resolve()):
+            raise InputError(f"is a link that leads out of {directory}; put what it leads to in its place", field=path)
+
+
 class ResultDirectory:
     """The directory of a reconstruction; files are written atomically.
 
     Parameters
     ----------
-    path : of the directory, which need not exist
+    path : of the directory, which need not exist; InputError if a link in it leads out of it
     say : called with a line about each foreign file that is renamed or left; a warning by default
     """
 
     def __init__(self, path: str | os.PathLike[str], say: Callable[[str], None] = WARN) -> None:
         self.path = Path(path)
         self.files = OwnFiles(self.path, say)
+        check_links(self.path)
 
     def __truediv__(self, name: str) -> Path:
         return self.path / name
@@ -336,7 +345,7 @@ class ResultDirectory:
             reprojection = attempt(
                 REPROJECTION, self.reprojection, None, "no views to show; nerif evaluate --measurement FILE adds them"
             )
-            measurement = _measurement(run) if reprojection is None else reprojection.measurement
+            measurement = self._measurement(run) if reprojection is None else reprojection.measurement
             if self.has(SURFACE[0]):
                 surface = attempt(SURFACE[0], lambda: SurfaceMap.read(self / SURFACE[0]), None, "no surface to show")
         if not finished:
@@ -367,12 +376,18 @@ class ResultDirectory:
         places = (path, self.path / name, self.path.parent / name)
         try:
             quantity = field_of(volumes)
-            path = next((p for p in places if p.is_file()), places[0])
+            path = next((p for p in places if is_near(p, self.path) and p.is_file()), None) or recorded(path, self.path)
             truth = read_volume(path, None if quantity in (None, INDEX) else quantity, gaps=True)
             ambient = volumes[INDEX].n_ambient if quantity == INDEX else None
             return truth if ambient is None else truth.relative_to(ambient)
         except InputError as error:
             gaps.append(Gap("truth", f"The truth cannot be shown: {error}"))
+            return None
+
+    def _measurement(self, run: dict[str, Any]) -> Measurement | None:
+        try:
+            return Measurement.read(recorded(str(run["measurement"]), self.path))
+        except (InputError, KeyError):
             return None
 
 
@@ -399,13 +414,6 @@ def _without_none(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_without_none(v) for v in value]
     return str(value) if isinstance(value, Path) else value
-
-
-def _measurement(run: dict[str, Any]) -> Measurement | None:
-    try:
-        return Measurement.read(str(run["measurement"]))
-    except (InputError, KeyError):
-        return None
 
 
 def _number(text: str | None) -> float:

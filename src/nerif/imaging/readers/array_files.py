@@ -8,6 +8,7 @@ import numpy as np
 
 from nerif.common.conventions import InputError
 from nerif.common.files import ending
+from nerif.common.netcdf import check_in_one_file
 from nerif.imaging.readers.frames import Frames
 
 __all__ = ["ArrayFrames", "Hdf5Frames"]
@@ -75,6 +76,7 @@ class Hdf5Frames(Frames):
         self._path, self._name = path, name
         try:
             with h5py.File(path, "r") as file:
+                check_in_one_file(file)
                 dims: dict[str, int] = {}
                 file.visititems(lambda key, x: dims.update({key: x.ndim}) if isinstance(x, h5py.Dataset) else None)
                 self._key = _choose(dims, dataset.strip("/"), name)

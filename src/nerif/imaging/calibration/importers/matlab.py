@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 
 from nerif.common.conventions import InputError
+from nerif.common.netcdf import check_in_one_file
 from nerif.imaging.calibration.cameras_file import CalibratedCamera, check_distortion, check_model, flat, numbers
 
 __all__ = ["read_matlab"]
@@ -44,11 +45,15 @@ READABLE = (b"double", b"single", b"cell", b"char", b"struct", b"logical", b"int
 
 def read_matlab(path: Path, pose: int = 1) -> list[CalibratedCamera]:
     """Read the cameras of a .mat file of version 5 or 7.3; target image number `pose` is the world frame."""
+    import h5py
     import pymatreader
 
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # unreadable objects are reported below
+            if h5py.is_hdf5(path):
+                with h5py.File(path, "r") as file:
+                    check_in_one_file(file)
             content = pymatreader.read_mat(str(path))
     except Exception as error:  # of SciPy and h5py, of many kinds
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
