@@ -8,6 +8,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 PIP := --quiet --disable-pip-version-check --no-compile  # byte code is written at the first import
+TORCH := torch $(if $(TORCH_INDEX),--no-deps --index-url $(TORCH_INDEX))
 PYTEST := $(BIN)/python -m pytest -n 2 --dist loadgroup --no-loadscope-reorder
 
 .PHONY: demo app test test-all short-tests all-tests lint docs dist study study-quick clean
@@ -41,7 +42,7 @@ docs: .venv/.dev
 
 dist: .venv/.dist
 	rm -rf dist
-	$(BIN)/python -m build
+	PIP_CONSTRAINT=constraints.txt $(BIN)/python -m build
 	$(BIN)/python -m twine check --strict dist/*
 	$(BIN)/check-wheel-contents dist/*.whl
 	ls -l dist
@@ -58,7 +59,7 @@ study-quick: .venv/.dev
 	touch $@
 
 .venv/.run: .venv/.made
-	$(BIN)/python -m pip install $(PIP) -c constraints.txt torch
+	$(BIN)/python -m pip install $(PIP) -c constraints.txt $(TORCH)
 	$(BIN)/python -m pip install $(PIP) -c constraints.txt -e .
 	touch $@
 

@@ -35,8 +35,9 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def copy(whole: Path, tmp_path: Path) -> Path:
-    """A copy to damage."""
+def copy(whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A copy to damage; the measurement and the truth that it names are in the current folder."""
+    monkeypatch.chdir(whole.parent)
     return Path(shutil.copytree(whole, tmp_path / "copy"))
 
 
