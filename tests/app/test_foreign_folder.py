@@ -71,7 +71,7 @@ def test_the_app_runs_nothing_of_a_folder_and_its_users_run_nonetheless(tmp_path
     assert not (tmp_path / "mark").exists()
 
 
-@pytest.mark.parametrize("link", [".nerif", ".nerif/jobs"])
+@pytest.mark.parametrize("link", [".nerif", ".nerif/jobs", ".nerif/checks", ".nerif/masks"])
 def test_a_folder_whose_links_lead_what_the_app_writes_elsewhere_is_refused(tmp_path, link):
     folder, elsewhere = tmp_path / "project", tmp_path / "elsewhere"
     (folder / link).parent.mkdir(parents=True)

@@ -28,7 +28,7 @@ class Workspace:
     """One project, shared by all pages and tabs; InputError if a link leads its files outside of the folder."""
 
     def __init__(self, project: Project) -> None:
-        for name in (OWN, f"{OWN}/jobs"):
+        for name in (OWN, f"{OWN}/jobs", f"{OWN}/checks", f"{OWN}/masks"):
             project.path(name)
         self.project, self.jobs, self.files = project, Jobs(project.folder), ImageFiles(project)
         self._drafts: dict[str, dict[str, Any]] = {}
