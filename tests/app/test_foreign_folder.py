@@ -1,4 +1,4 @@
-"""A folder of somebody else: nothing in it is run, and no run that is found in it is started."""
+"""A folder of another person: nothing in it is run, and no run that is found in it is started."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A result directory of somebody else leads to no other file."""
+"""A result directory of another person leads to no other file."""
 
 from __future__ import annotations
 

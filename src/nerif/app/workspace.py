@@ -40,7 +40,7 @@ class Workspace:
     def draft(self, page: str) -> dict[str, Any]:
         """Return the entries of a page that differ from the defaults; they survive a reload and a restart.
 
-        The file may come from somebody else: COMMAND_LINE_ONLY survive no restart.
+        The file may come from another person: COMMAND_LINE_ONLY survive no restart.
         """
         if not self._drafts and self._file.is_file():
             try:

@@ -66,7 +66,7 @@ def is_near(path: str | os.PathLike[str], holder: Path) -> bool:
 def recorded(path: str | os.PathLike[str], holder: Path) -> Path:
     """Return the path of a file that a result, the holder, names; InputError if it is not near.
 
-    A result may come from somebody else, and its report would show the content of any file.
+    A result may come from another person, and its report would show the content of any file.
     """
     if not is_near(path, holder):
         raise InputError(

@@ -91,7 +91,7 @@ def reading(message: str) -> Iterator[None]:
 
 
 def check_in_one_file(file: h5py.File) -> None:
-    """Raise OSError if a part of an HDF5 file, which may come from somebody else, is in another file."""
+    """Raise OSError if a part of an HDF5 file, which may come from another person, is in another file."""
     import h5py
 
     def check(name: str, item: h5py.Group | h5py.Dataset) -> None:

@@ -117,7 +117,7 @@ class Result:
 
 
 def check_links(directory: Path) -> None:
-    """Raise an InputError if a link of a result, which may come from somebody else, leads out of its directory."""
+    """Raise an InputError if a link of a result, which may come from another person, leads out of its directory."""
     names = (*FILES, *MERIDIAN, *SURFACE, LIVE, LIVE_FIELD, WRITTEN, "tensorboard", CROSS_VALIDATION, FIGURES, TRIALS)
     for path in (*(directory / name for name in names), *(directory / TRIALS).glob("[0-9]*")):
         if path.is_symlink() and not path.resolve().is_relative_to(directory.resolve()):

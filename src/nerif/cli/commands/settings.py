@@ -48,7 +48,7 @@ Flat = tyro.conf.arg(name="")
 IGNORED_TABLES = ("about",)  # results in run.toml
 COMMAND_LINE_ONLY = ("cluster", "dashboard", "force", "host")
 """Options that run code of another machine or a shell (cluster), open a port to others, or overwrite files: a file,
-which may come from somebody else, cannot set them."""
+which may come from another person, cannot set them."""
 
 
 @dataclass(frozen=True, kw_only=True)
