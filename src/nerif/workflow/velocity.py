@@ -161,7 +161,7 @@ def _improvement(
 def _projectors(film: VolumeSequence, frames: slice, measurement: str | os.PathLike[str] | None) -> list[Projector]:
     """Return the forward projectors of the frames of a film, with its displacements."""
     about = film.attributes
-    path = measurement or (recorded(about["measurement"], film.path) if "measurement" in about else None)
+    path = measurement or about.get("measurement")
     if path is None:
         raise InputError("no measurement is named in it; give --measurement", field=film.path)
     if about.get("symmetry"):
