@@ -16,6 +16,7 @@ from nerif.analysis.consistency import (
     check_consistency,
     compare,
     fit,
+    image_remarks,
     of_one_view,
     open_faces,
     orders,
@@ -184,6 +185,19 @@ def test_camera_shake_and_missing_pixels_are_remarks(clean):
     found = check_consistency(replace(shaken, valid=valid), voxels=20)
     assert any("view 60deg: displacement at the border (1." in r for r in found.remarks)
     assert any("view 0deg: only 33% of its pixels" in r for r in found.remarks)
+
+
+def test_bins_need_not_be_square():
+    """Beside a camera of two rows, bins have two rows and six columns."""
+    ring = Ring(views=2, arc=(0.0, 90.0), image_size=(60, 240), pixel_pitch=0.02)
+    line, sheet = ring.cameras()
+    displacement = torch.full((2, 60, 240, 2), torch.nan)
+    displacement[0, :2], displacement[1] = 0.0, torch.tensor([0.3, 0.6])
+    whole = Measurement((replace(line, image_size=(2, 240)), sheet), displacement, BOX, 1.00027)
+    small = binned(whole, 40)
+    assert [camera.image_size for camera in small.cameras] == [(1, 40), (30, 40)]
+    (remark,) = image_remarks(whole, small, [1.0, 1.0])
+    assert "at the border (0.30, 0.60) px" in remark
 
 
 def test_a_small_flow_among_zeros_is_no_spike(clean):

@@ -291,13 +291,15 @@ def image_remarks(measurement: Measurement, small: Measurement, valid: Sequence[
         offset, spread = d[border].median(dim=0).values, d[border].std(dim=0)
         rms = d[finite].square().mean().sqrt()
         if float(offset.norm()) > 0.5 * float(rms) and bool((offset.abs() > 2 * spread).any()):
-            remarks.append(f"view {name}: {_of_border(kind, offset, measurement.cameras[i].image_size[1] / columns)}")
+            focal, binned_focal = (m.cameras[i].intrinsics.diagonal()[:2] for m in (measurement, small))
+            remarks.append(f"view {name}: {_of_border(kind, offset, focal / binned_focal)}")
     return remarks
 
 
-def _of_border(kind: type[ForwardModel], offset: Tensor, bin_edge: float) -> str:
+def _of_border(kind: type[ForwardModel], offset: Float[Tensor, " c"], bins: Float[Tensor, 2]) -> str:
+    """Describe the values of a border; `bins`: columns and rows in each."""
     if kind.background:
-        u, v = (float(x) * bin_edge for x in offset)
+        u, v = (offset * bins.to(offset)).tolist()
         return (
             f"displacement at the border ({u:.2f}, {v:.2f}) px; if the camera moved, nerif displacement "
             "--shake-border removes it"
