@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import torch
 
-from nerif.analysis.verdict import ONE_CAMERA, RATINGS, Estimate, Verdict, verdict
+from nerif.analysis.verdict import C_NOISE, N0_PIXELS, ONE_CAMERA, RATINGS, Estimate, Verdict, verdict
 from nerif.data.volume import Volume
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Grid, Ring
@@ -104,6 +104,15 @@ def test_misfit_and_noise_count_as_error():
     at_noise = judged(views=views_of(0.02), cross_validation=first_run(0.02, 0.02))
     louder = judged(views=views_of(0.2, rms_white=0.2, rms_sigma=0.2), cross_validation=first_run(0.2, 0.2))
     assert 0.002 < at_noise.error < louder.error
+
+
+def test_the_misfit_of_a_first_run_scatters_as_that_of_its_one_view():
+    """Six times the pixels would scatter by the root of six less; the misfit of the whole run is at the noise."""
+    first = first_run(0.07, 0.03)
+    six_times = {**first, "fitted_views": [noisy("b", 0.03, pixels=6000)]}
+    errors = [judged(views=views_of(0.02), cross_validation=run).error for run in (first, six_times)]
+    noise = (C_NOISE * 0.02) ** 2 * N0_PIXELS / 6000
+    assert (errors[0] ** 2 - noise) / (errors[1] ** 2 - noise) == pytest.approx(6**0.5, rel=0.05)
 
 
 @pytest.mark.parametrize("factor", [0.5, 2.0])

@@ -15,9 +15,10 @@ untrained part of e_1 in proportion to the misfit, and the undetermined part, al
 
     e = max(f / f_1 e_1, G (e_1^2 - K^2 f_1^2)^(1/2))
 
-The mean square residual of n pixels scatters by s^2 (2 / n)^(1/2), a lower limit for e, and for f and f_1 in their
-ratio. The coefficients are fitted to simulated measurements with and without defects; their accuracy on others is in
-benchmarks/results/verdicts-cpu.md. Standard deviations give a second estimate, combined as in `Estimate.mean`.
+The mean square residual of n pixels scatters by s^2 (2 / n)^(1/2), a lower limit for e, and, with the pixels of f_1,
+for f and f_1 in their ratio. The coefficients are fitted to simulated measurements with and without defects; their
+accuracy on others is in benchmarks/results/verdicts-cpu.md. Standard deviations give a second estimate, combined as in
+`Estimate.mean`.
 """
 
 from __future__ import annotations
@@ -283,8 +284,8 @@ def _after_first_run(
     """e after the whole run from e_1 (error); e_1 itself where the misfit of the first run is unknown."""
     if not first_fitted:
         return error
-    (after, white, pixels), (before, *_) = _misfit(fitted, noise), _misfit(first_fitted, noise)
-    scatter = white**2 * _scatter(pixels)
+    (after, *_), (before, white, pixels) = _misfit(fitted, noise), _misfit(first_fitted, noise)
+    scatter = white**2 * _scatter(pixels)  # of the one view of which f_1 is known
     trained = min(max(_ratio(after**2 + scatter, before**2 + scatter), MIN_MISFIT_RATIO), 1.0)
     undetermined = math.sqrt(max(error**2 - (K_UNTRAINED * before) ** 2, 0.0))
     return max(trained * error, G_UNDETERMINED * undetermined)
