@@ -15,7 +15,9 @@ from nerif.fields.network import NetworkShape
 from nerif.forward.deflection import LeverArm
 from nerif.forward.path_integral import PathIntegral, project
 from nerif.geometry import Lens
+from nerif.reconstruction.detail import Detail
 from nerif.reconstruction.neural.presets import PRESETS
+from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.reconstruction.voxels.total_variation import TotalVariation
 
 pytestmark = pytest.mark.filterwarnings("ignore:User provided device_type of 'cuda'")
@@ -145,6 +147,26 @@ def test_no_run_mixes_devices_or_rounds_outside_the_network(measurement, gpu, na
     assert not result.outcome.failed
     assert result.device == str(GPU)
     assert not gpu.rounded
+
+
+@pytest.mark.parametrize(
+    ("symmetry", "device"), [("axis", "cpu"), pytest.param("none", str(GPU), marks=pytest.mark.slow)]
+)
+def test_a_rig_and_detail_beside_voxels_mix_no_devices(measurement, gpu, monkeypatch, symmetry, device):
+    """The operators of a symmetric flow run on the CPU, and all that is combined with them."""
+    monkeypatch.setattr("nerif.reconstruction.voxels.descent.ROUNDS", 1)
+    settings = Tikhonov(
+        voxels=8, iterations=1, regularisation=1e-3, symmetry=symmetry, axis_sigma_mm=0.0, axis_sigma_deg=0.0,
+        refine=("cameras",), coarse_to_fine=False, device=str(GPU),
+    )  # fmt: skip
+    two, withheld = measurement.select(measurement.names[:2]), measurement.select(measurement.names[2:3])
+    with gpu:
+        result = settings(two)
+        detail = Detail(result.field, two, replace(settings, model="curved"), result.axis, 1, 8)
+        posterior = detail.solve(detail.first(blurred=True), iterations=1)
+        error = detail.prediction_error(detail.others(withheld), posterior.coefficients)
+    assert result.device == device
+    assert error > 0
 
 
 @pytest.mark.slow

@@ -165,8 +165,8 @@ class Detail:
         source = getattr(settings, "source", AUTO)
         self.measurement = of_source(measurement, source, preferred="displacements")
         self.base, self.settings, self.axis, self.coarse = field, settings, axis, coarse
-        self.device = resolve_device(settings.device)
-        self.layout = layout_of(self.measurement, axis, device=self.device)
+        self.layout = layout_of(self.measurement, axis, device=resolve_device(settings.device))
+        self.device = self.layout.device
         fine = self.layout.grid(voxels or voxels_of(self.measurement))
         self.bins = coarse * bins_of(self.measurement, fine, voxels=1.0)
         self.grid = self.layout.grid(max(1, max(fine.shape) // coarse))

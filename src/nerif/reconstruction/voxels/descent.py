@@ -78,12 +78,13 @@ class Descent:
         measurement = of_source(measurement, settings.source, preferred="displacements")
         measurement = with_gauge(apply_aperture(measurement, settings.aperture), settings)
         self.settings, self.measurement, self.on_step, self.start = settings, measurement, on_step, start
-        self.device = resolve_device(settings.device)
-        self.cores = Cores(self.device)
         check_gauge(measurement, bool(settings.probes), settings.hull)
         self.axis = axis_of(settings, measurement)
         dtype = getattr(torch, settings.precision)
-        self.layout = layout_of(measurement, self.axis, settings.basis, settings.step, self.device, dtype)
+        device = resolve_device(settings.device)
+        self.layout = layout_of(measurement, self.axis, settings.basis, settings.step, device, dtype)
+        self.device = self.layout.device
+        self.cores = Cores(self.device)
         grids = self.layout.grids(settings.voxels, settings.coarse_to_fine)
         self.levels = levels(measurement, grids, settings.coarse_to_fine)
         finest = grids[-1]

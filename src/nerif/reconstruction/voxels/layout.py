@@ -24,6 +24,7 @@ from nerif.reconstruction.voxels.symmetric_operator import SymmetricOperator
 
 __all__ = ["InSpace", "Layout", "Symmetric", "layout_of"]
 
+CPU = torch.device("cpu")
 MIN_FIRST_VOXELS = 12  # along the longest edge of the first grid
 MIN_HALVED_VOXELS = 4  # along an edge that is halved
 
@@ -36,7 +37,7 @@ class Layout(ABC):
     faces: tuple[str, ...]  # of it, on which the field is ambient
     basis: str  # of the spline
     step: float | None = None  # of operators: distance of planes in voxels
-    device: torch.device | str = "cpu"
+    device: torch.device = CPU  # of coefficients and operators
     dtype: torch.dtype = torch.float32
 
     @property
@@ -86,12 +87,15 @@ class Layout(ABC):
 
 def layout_of(
     measurement: Measurement, axis: Axis | None, basis: str = "cubic", step: float | None = None,
-    device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32,
+    device: torch.device = CPU, dtype: torch.dtype = torch.float32,
 ) -> Layout:  # fmt: skip
-    """Return the layout for a measurement with its gauge (with_gauge)."""
+    """Return the layout for a measurement with its gauge (with_gauge).
+
+    A symmetric field is projected on the CPU; whatever is combined with its coefficients is on the layout's device.
+    """
     common: dict[str, Any] = {"box": measurement.box, "faces": measurement.ambient_faces, "basis": basis, "step": step}
-    common |= {"device": device, "dtype": dtype}
-    return Symmetric(symmetry=axis.symmetry, **common) if axis else InSpace(**common)
+    common |= {"dtype": dtype}
+    return Symmetric(symmetry=axis.symmetry, **common) if axis else InSpace(device=device, **common)
 
 
 class InSpace(Layout):
