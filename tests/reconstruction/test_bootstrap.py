@@ -15,6 +15,8 @@ from nerif.geometry import Box, Grid, Ring
 from nerif.physics.quantities import GasSettings
 from nerif.reconstruction.base import Outcome, Reconstruction
 from nerif.reconstruction.neural.neural import NeRIF
+from nerif.reconstruction.rig.posterior import RigPosterior
+from nerif.reconstruction.rig.refinement import Refinement
 from nerif.reconstruction.uncertainty.bootstrap import (
     BLOCK,
     LOST,
@@ -47,6 +49,11 @@ def result_of(field: VoxelField, box: Box = BOX) -> Reconstruction:
     return Reconstruction(field, box, AMBIENT, [], Outcome("converged", ""), {})
 
 
+def seeded(trial: int) -> torch.Generator:
+    """The random numbers of a trial."""
+    return torch.Generator().manual_seed(2_000_003 + trial)
+
+
 def flat(voxels: int, value: float = -1e-4) -> Volume:
     grid = Grid.of_resolution(BOX, voxels)
     return Volume.of(torch.full(grid.shape, value, dtype=torch.float64), grid, "index_excess", AMBIENT)
@@ -59,7 +66,7 @@ def trial_of(volume: Volume, error: torch.Tensor | float) -> Reconstruction:
 @pytest.fixture
 def original(measurement) -> Original:
     result = result_of(hot(measurement.box), measurement.box)
-    return Original(result, NeRIF(seed=3), measurement, lambda field: reproject(field, measurement).maps)
+    return Original(result, NeRIF(seed=3), measurement, lambda field, data: reproject(field, data).maps)
 
 
 def test_trials_have_projections_of_the_field_and_residuals_with_random_signs_in_blocks(original):
@@ -68,8 +75,11 @@ def test_trials_have_projections_of_the_field_and_residuals_with_random_signs_in
     torch.testing.assert_close(member.truth.values, original.result.volume(grid).values)
     assert member.reconstructor.seed == 4
     data = member.measurement.displacement
-    residual = data - original.project(VoxelField.through(member.truth.values.double(), grid))["deflection"]
-    before = original.measurement.displacement - original.project(original.result.field)["deflection"]
+    spline = VoxelField.through(member.truth.values.double(), grid)
+    residual, before = (
+        displacement - original.project(field, original.measurement)["deflection"]
+        for displacement, field in ((data, spline), (original.measurement.displacement, original.result.field))
+    )
     sign = (residual / before).nan_to_num(1.0)
     torch.testing.assert_close(sign.abs(), torch.ones_like(sign), rtol=0, atol=0.05)
     block = sign[:, :BLOCK, :BLOCK]
@@ -85,6 +95,35 @@ def test_pixels_that_were_not_measured_stay_so(original):
     holes = replace(original, measurement=replace(original.measurement, displacement=values))
     assert torch.equal(Trials("fast").member(1, holes).measurement.usable, holes.measurement.usable)
     assert int(holes.measurement.usable.sum()) < int(original.measurement.usable.sum())
+
+
+def test_trials_of_a_refined_rig_have_calibrated_cameras_and_are_seen_by_their_own(measurement):
+    settings = {"refine": ("cameras", "shift"), "pose_sigma_mm": 2.0, "pose_sigma_deg": 0.2, "shift_sigma_px": 0.1}
+    blank = Refinement.of_table(measurement, settings, ())
+    random = torch.randn(blank.sigma.shape, generator=torch.Generator().manual_seed(0)).double()
+    blank.values = blank.sigma * random
+    table, parameters = blank.table(), blank.sigma[:, blank.columns].numel()
+    rig = RigPosterior(table, blank, 0.3 * torch.eye(parameters, dtype=torch.float64))
+    result = replace(result_of(hot(measurement.box), measurement.box), rig=table)
+    original = Original(result, NeRIF(), measurement, lambda field, data: reproject(field, data).maps, rig)
+    member = Trials("fast").member(1, original)
+    assert member.measurement.cameras == measurement.cameras
+    deviations = BootstrapDeviations(member.truth, GasSettings(), original)
+    for own in (rig.draw(seeded(1)), table):  # the right rig, and that of the reconstruction
+        deviations.add_trial(member, replace(trial_of(member.truth, 0.0), rig=own))
+    right, wrong = deviations.residual_ratios
+    assert right == pytest.approx(1.0, rel=0.02)
+    assert wrong > 1.2
+
+
+def test_rigs_are_drawn_with_their_covariance(measurement):
+    settings = {"refine": ("background",), "pose_sigma_mm": None, "pose_sigma_deg": None, "shift_sigma_px": 0.1}
+    rig = Refinement.of_table(measurement, settings, ())
+    root = torch.randn(len(rig.names), len(rig.names), generator=seeded(0), dtype=torch.float64)
+    posterior, generator = RigPosterior(rig.table(), rig, root @ root.T), seeded(1)
+    draws = [[row["values"]["background"] for row in posterior.draw(generator)] for _ in range(2000)]
+    drawn = torch.tensor(draws).T / rig.sigma[:, rig.columns].float()
+    assert float((torch.cov(drawn) - root @ root.T).norm() / (root @ root.T).norm()) < 0.1
 
 
 @pytest.mark.parametrize("share", [1.02, 0.98, 0.9])
@@ -103,8 +142,9 @@ def test_deviations_grow_with_the_detail_that_trials_lose(original, share):
 
 @pytest.mark.parametrize("worse", [1.0, 2.0, 0.0])
 def test_deviations_shrink_with_the_residual_relative_to_that_of_trials(original, worse):
-    projections = original.project(original.result.field)["deflection"].to(original.measurement.displacement)
-    residual = original.measurement.displacement - projections
+    measured = original.measurement.displacement
+    projections = original.project(original.result.field, original.measurement)["deflection"].to(measured)
+    residual = measured - projections
     truth = original.result.volume(Grid.of_resolution(original.result.box, 16))
     deviations = BootstrapDeviations(truth, GasSettings(), original)
     assert deviations.better == 1.0  # without trials

@@ -72,6 +72,20 @@ def test_other_open_faces_and_checkpoints_without_a_fingerprint_are_refused(meas
             method(measurement, resume=State(state.tensors, scalars))
 
 
+@pytest.mark.parametrize("method", [NETWORK, VOXELS])
+def test_the_uncertainty_of_poses_is_data_where_they_are_refined(measurement, method):
+    uncertain = replace(
+        measurement, cameras=tuple(replace(c, pose_sigma=torch.full((6,), 1e-3)) for c in measurement.cameras)
+    )
+    method(uncertain, resume=method(measurement).state)
+    refined = replace(method, refine=("cameras",))
+    parts = [fingerprint(m, refine=refined.refine) for m in (measurement, uncertain)]
+    assert [name for name in parts[0] if parts[0][name] != parts[1][name]] == ["pose_sigma"]
+    with refused("resume") as error:
+        refined(uncertain, resume=State({}, {"fingerprint": parts[0]}))
+    assert "pose_sigma" in str(error.value)
+
+
 def test_constants_of_the_forward_model_are_data(ball, cameras, box):
     kind = technique("interferometry")
     m = simulate(ball, cameras, box, 1.0, steps=10, wavelength_nm=532.0, techniques=[kind])

@@ -19,13 +19,17 @@ from nerif.fields.base import Field
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Ring
 from nerif.geometry.pose import GEOMETRY, Corrections
+from nerif.reconstruction.progress import Monitor
 from nerif.reconstruction.rig.parameters import NAMES, UNCONSTRAINED, refinement_lines, with_corrections
-from nerif.reconstruction.rig.posterior import with_posterior
+from nerif.reconstruction.rig.posterior import RigPosterior
 from nerif.reconstruction.rig.refinement import Refinement, refit
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.reconstruction.voxels.total_variation import TotalVariation
 from nerif.report.figures import draw_corrections
+from nerif.results.directory import ResultDirectory
 from nerif.simulation.simulate import simulate
+from nerif.workflow.job import Run
+from nerif.workflow.pipeline import reconstruct_into
 from refusals import refused
 
 BOX = Box((-20.0,) * 3, (20.0,) * 3)
@@ -76,7 +80,7 @@ def error_px(measurement: Measurement, truth: Measurement, view: int = 2) -> flo
 def posterior(measurement: Measurement, field: Field, **settings) -> list[dict]:
     settings = {**SETTINGS, **settings}
     table = Refinement.of_table(measurement, settings, ()).table()
-    return with_posterior(table, measurement, field, settings)
+    return RigPosterior.of(table, measurement, field, settings).table
 
 
 @pytest.mark.slow
@@ -141,10 +145,10 @@ def test_a_view_without_displacements_has_no_posterior(measured):
     rig = Refinement.for_measurement(measured, SETTINGS["refine"], 0.4, 0.02, 0.05)
     rig.values = 0.1 * rig.sigma
     table, rest = rig.table(), measured.without([measured.names[1]])
-    rows = with_posterior(table, rest, BALLS, SETTINGS)
+    rows = RigPosterior.of(table, rest, BALLS, SETTINGS).table
     assert [row["name"] for row in rows] == list(measured.names)
     assert rows.pop(1) == table.pop(1)
-    assert rows == with_posterior(table, rest, BALLS, SETTINGS)
+    assert rows == RigPosterior.of(table, rest, BALLS, SETTINGS).table
 
 
 @pytest.mark.slow
@@ -210,6 +214,22 @@ def test_a_result_has_the_posterior_and_the_withheld_view_with_both_cameras(meas
     assert f"{withheld}, camera refined" in page
     axes = draw_corrections(Figure().subplots(), metrics["rig"])
     assert [text.get_text() for text in axes.get_legend().get_texts()] == [row["name"] for row in metrics["rig"]]
+
+
+def test_trials_refine_rigs_of_their_own_which_are_read_again(measured, tmp_path, monkeypatch):
+    monkeypatch.setattr("nerif.reconstruction.rig.posterior.VOXELS", 4)
+    monkeypatch.setattr("nerif.reconstruction.voxels.descent.ROUNDS", 2)
+    monkeypatch.setattr("nerif.reconstruction.uncertainty.bootstrap.VOXELS", 12)
+    out, lines = ResultDirectory(tmp_path / "r"), []
+    method = Tikhonov(voxels=10, iterations=4, regularisation=1e-2, refine=("cameras",), device="cpu")
+    run = Run(withhold=("none",), uncertainty="fast", report=False)
+    for resume in (False, True):
+        result = reconstruct_into(out.path, measured, method, run, resume=resume, monitor=Monitor(lines.append))
+    assert [row["values"] for row in result.rig] == [row["values"] for row in out.rig()]
+    values = [[row["values"]["shift_x"] for row in rig] for rig in (out.rig(), *(out.member(i).rig() for i in (1, 2)))]
+    assert values[0] != values[1] != values[2]
+    first, again = (line for line in lines if line.startswith("uncertainty from 2 trials"))
+    assert first == again
 
 
 @pytest.mark.parametrize("table", [[{"name": "a"}], [{"name": "a", "values": {"lens": 1.0}}], [None]])

@@ -5,21 +5,26 @@ from __future__ import annotations
 import json
 import signal
 from contextlib import nullcontext
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import pytest
 import torch
 
+from nerif.analysis.evaluation import evaluate_views
+from nerif.analysis.prediction import reproject
 from nerif.cli.cli import main
+from nerif.fields.grid import VoxelField
 from nerif.fields.network import NetworkShape
-from nerif.reconstruction.base import Step
+from nerif.geometry import Grid
+from nerif.geometry.pose import GEOMETRY, Corrections
+from nerif.reconstruction.base import Outcome, Reconstruction, Step
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.progress import Monitor
 from nerif.reconstruction.uncertainty.bootstrap import best_covered
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.report.summary import accuracy_rows, statements
 from nerif.results.directory import ResultDirectory
-from nerif.workflow.cross_validation import MIN_VIEWS, withheld_views
+from nerif.workflow.cross_validation import MIN_VIEWS, CrossValidation, withheld_views
 from nerif.workflow.job import Run
 from nerif.workflow.pipeline import reconstruct_into
 
@@ -45,6 +50,28 @@ def test_a_view_is_predicted_before_it_is_used(measurement, tmp_path, method):
     assert {f"View {name}, withheld from the first run", f"View {name}, after the whole run"} <= set(figures)
     assert any("Cross-validation: a short run" in s.text for s in statements(result))
     assert result.settings["withhold"] == ["auto"]
+
+
+def test_the_field_of_the_short_run_is_seen_by_the_cameras_that_it_refined(measurement, ball, tmp_path):
+    """And the withheld view by a camera that is refined against the field."""
+    shifts = torch.zeros(len(measurement.cameras), len(GEOMETRY), dtype=torch.float64)
+    shifts[:, 3:5] = torch.randn(len(shifts), 2, generator=torch.Generator().manual_seed(0))
+    knocked = replace(measurement, cameras=Corrections(measurement.cameras, -shifts).corrected)
+    method = replace(VOXELS, refine=("cameras",), pose_sigma_mm=1.0)
+    validation = CrossValidation(ResultDirectory(tmp_path), method, knocked)
+    assert validation.fit is None
+    rows = [dict(zip(GEOMETRY, row, strict=True)) for row in shifts.tolist()]
+    rig = [{"name": n, "values": row} for n, row in zip(knocked.names, rows, strict=True) if n != validation.view]
+    grid = Grid.of_resolution(measurement.box, 24)
+    field = VoxelField.through(ball.sample(grid), grid)
+    out, outcome = ResultDirectory(tmp_path).cross_validation, Outcome("converged", "")
+    out.path.mkdir()
+    out.write_field(Reconstruction(field, measurement.box, measurement.n_ambient, [], outcome, asdict(method), rig=rig))
+    fit = validation.fit
+    for data in (fit.training, fit.withheld):
+        calibrated, refined = (evaluate_views(reproject(fit.field, m)) for m in (knocked.select(data.names), data))
+        for before, after in zip(calibrated, refined, strict=True):
+            assert after["rms_over_sigma"] < 2 < 0.2 * before["rms_over_sigma"]
 
 
 def test_the_short_run_does_not_depend_on_the_withheld_view(measurement, tmp_path):

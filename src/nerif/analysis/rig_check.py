@@ -13,7 +13,7 @@ from nerif.reconstruction.device import on_free_cores
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.progress import QUIET, Monitor
 from nerif.reconstruction.rig.parameters import MOVED, RefinedView, refinement_lines
-from nerif.reconstruction.rig.posterior import with_posterior
+from nerif.reconstruction.rig.posterior import RigPosterior
 from nerif.reconstruction.shared_settings import Aperture
 from nerif.reconstruction.sources import of_source
 
@@ -62,7 +62,8 @@ def check_rig(
     with monitor.training("refining the rig") as on_step:
         result = settings(data, on_step)
     with monitor.counting("accuracy of the rig") as bar:
-        table = with_posterior(result.rig, apply_aperture(data, aperture), result.field, result.settings, bar)
+        data = apply_aperture(data, aperture)
+        table = RigPosterior.of(result.rig, data, result.field, result.settings, bar).table
     lines = refinement_lines(table)
     moved = [row["name"] for row in table if row["correction_over_sigma"] > MOVED]
     first = len(lines) - len(moved)

@@ -32,6 +32,7 @@ from nerif.geometry import Box, Camera, Grid
 from nerif.geometry.body import Body
 from nerif.geometry.symmetry import Symmetry
 from nerif.reconstruction.base import OnStep, Reconstruction, State, Step
+from nerif.reconstruction.rig.parameters import RefinedView
 
 __all__ = [
     "CHECKPOINT",
@@ -39,10 +40,12 @@ __all__ = [
     "check_fingerprint",
     "checkpoints",
     "digest",
+    "digest_of_field",
     "fingerprint",
     "read_bodies",
     "read_field",
     "read_quantity",
+    "read_rig",
     "read_state",
     "read_tensors",
     "write_field",
@@ -55,8 +58,13 @@ VERSION, WITH_BODIES = 1, 2  # of the field file
 BODIES = "bodies."  # beginning of the names of their tensors
 
 
-def fingerprint(measurement: Measurement, open_faces: tuple[str, ...] = ()) -> dict[str, str]:
-    """Return digests of the parts of a measurement on which a reconstruction depends, by name."""
+def fingerprint(
+    measurement: Measurement, open_faces: tuple[str, ...] = (), refine: Sequence[str] = ()
+) -> dict[str, str]:  # fmt: skip
+    """Return digests of the parts of a measurement on which a reconstruction depends, by name.
+
+    The uncertainty of the poses is one of them where a rig is refined.
+    """
     maps: dict[str, str] = {}
     constants: dict[str, list[Any]] = {}
     for o in measurement.observations:
@@ -71,6 +79,7 @@ def fingerprint(measurement: Measurement, open_faces: tuple[str, ...] = ()) -> d
         **maps,
         "valid pixels": digest([measurement.usable]),
         "flow_mask": digest([measurement.flow_mask]),
+        **({"pose_sigma": digest(camera.pose_sigma for camera in measurement.cameras)} if refine else {}),
         **({"bodies": digest(_meshes(measurement.bodies).values())} if measurement.bodies else {}),
         "box": digest([measurement.box.lower, measurement.box.upper]),
         "n_ambient": digest([measurement.n_ambient]),
@@ -119,6 +128,12 @@ def digest(parts: Iterable[Any]) -> str:
     return result.hexdigest()
 
 
+def digest_of_field(field: Field) -> str:
+    """Return a digest of a field."""
+    tensors, entries = _entries_of(field)
+    return digest([*tensors.values(), entries])
+
+
 def write_field(directory: Path, result: Reconstruction) -> None:
     """Write a field atomically, with everything needed to evaluate it."""
     version = WITH_BODIES if result.bodies else VERSION
@@ -126,6 +141,7 @@ def write_field(directory: Path, result: Reconstruction) -> None:
     about |= {"quantity": result.quantity}
     if result.bodies:
         about["bodies"] = [body.name for body in result.bodies]
+    about |= {"rig": result.rig} if result.rig else {}
     tensors, entries = _entries_of(result.field)
     tensors |= _meshes(result.bodies)
     domain = _domain(result.field)
@@ -242,6 +258,11 @@ def _field_of(tensors: dict[str, Tensor], about: dict[str, Any], box: Box, bodie
 def read_quantity(directory: Path) -> str:
     """Read the quantity of the field of a result directory (volume.QUANTITIES)."""
     return str(read_tensors(directory / FIELD)[1].get("quantity", INDEX))
+
+
+def read_rig(directory: Path) -> list[RefinedView]:
+    """Read the corrections of the cameras of a result directory; none if they were not refined."""
+    return list(read_tensors(directory / FIELD)[1].get("rig", ()))
 
 
 def write_state(directory: Path, state: State) -> None:

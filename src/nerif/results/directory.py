@@ -31,8 +31,9 @@ from nerif.geometry.body import Body
 from nerif.geometry.symmetry import Symmetry
 from nerif.reconstruction import files as field_files
 from nerif.reconstruction.base import Reconstruction, State, sampled
-from nerif.reconstruction.files import CHECKPOINT, FIELD, read_bodies, read_field, read_quantity, read_state
+from nerif.reconstruction.files import CHECKPOINT, FIELD, read_bodies, read_field, read_quantity, read_rig, read_state
 from nerif.reconstruction.methods import METHODS
+from nerif.reconstruction.rig.parameters import RefinedView
 from nerif.results.metrics import Metrics
 
 __all__ = [
@@ -254,6 +255,10 @@ class ResultDirectory:
     def quantity(self) -> str:
         """Return the quantity of the field (volume.QUANTITIES)."""
         return read_quantity(self.path)
+
+    def rig(self) -> list[RefinedView]:
+        """Return the corrections of the cameras; none if they were not refined."""
+        return read_rig(self.path)
 
     def state(self) -> State:
         """Return the checkpoint."""

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from nerif.common.conventions import InputError
 from nerif.common.files import atomic
 from nerif.data.measurement import Measurement
 from nerif.fields.base import Field
 from nerif.reconstruction.base import OnStep, Outcome, Reconstruction, Reconstructor, State, Step, compose
-from nerif.reconstruction.files import CHECKPOINT, FIELD, checkpoints, fingerprint, write_state
+from nerif.reconstruction.files import CHECKPOINT, FIELD, checkpoints, digest_of_field, fingerprint, write_state
 from nerif.reconstruction.progress import QUIET, Monitor
 from nerif.results.directory import ResultDirectory
 
@@ -31,7 +30,6 @@ class CheckpointedRun:
     reconstructor : settings
     data : to reconstruct from
     start : initial field, or None
-    dependencies : further inputs
     checkpoint_every : s
     monitor : of the progress
     restart : whether to ignore the content of the directory
@@ -42,7 +40,6 @@ class CheckpointedRun:
     reconstructor: Reconstructor
     data: Measurement
     start: Field | None = None
-    dependencies: Mapping[str, str] = field(default_factory=dict)
     checkpoint_every: float = 60.0
     monitor: Monitor = QUIET
     restart: bool = False
@@ -62,7 +59,7 @@ class CheckpointedRun:
         if self.resumable:
             try:
                 if self.directory.has(FIELD):
-                    return self._read()
+                    return self.read()
                 state = self.directory.state()
             except InputError as error:
                 self.monitor.say(f"{error}; {title} is repeated")
@@ -78,12 +75,15 @@ class CheckpointedRun:
             self.directory.files.remove([CHECKPOINT])
         return result
 
-    def _read(self) -> Reconstruction:
+    def read(self) -> Reconstruction:
+        """Return the result that the directory holds."""
         settings = dataclasses.asdict(self.reconstructor)  # type: ignore[call-overload]
         outcome = Outcome("converged", "read from disk")
         field, box, n_ambient = self.directory.field()
         quantity, bodies = self.directory.quantity(), self.data.bodies
-        return Reconstruction(field, box, n_ambient, [], outcome, settings, quantity=quantity, bodies=bodies)
+        return Reconstruction(
+            field, box, n_ambient, [], outcome, settings, quantity=quantity, rig=self.directory.rig(), bodies=bodies
+        )
 
     def _write_inputs(self, resumed: bool) -> OnStep:
         """Return a callback that clears the directory at the first step of a new run and writes its inputs."""
@@ -102,8 +102,9 @@ class CheckpointedRun:
 
     @property
     def _inputs(self) -> str:
-        """Settings, data and further inputs as text."""
+        """Settings, data and initial field as text."""
         settings = dataclasses.asdict(self.reconstructor)  # type: ignore[call-overload]
         settings = {name: value for name, value in settings.items() if name not in (*self.limits, "time_limit")}
-        inputs = {"data": fingerprint(self.data), **self.dependencies, **settings}
+        start = None if self.start is None else digest_of_field(self.start)
+        inputs = {"data": fingerprint(self.data, refine=settings.get("refine", ())), "start": start, **settings}
         return json.dumps(inputs, indent=1, default=str) + "\n"

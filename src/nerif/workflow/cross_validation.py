@@ -13,8 +13,11 @@ from nerif.analysis.prediction import reproject
 from nerif.common.conventions import InputError
 from nerif.common.files import write_json
 from nerif.data.measurement import Measurement
+from nerif.fields.base import Field
 from nerif.reconstruction.base import OnStep, Reconstruction, Reconstructor
+from nerif.reconstruction.files import FIELD
 from nerif.reconstruction.progress import QUIET, Monitor
+from nerif.reconstruction.rig.refinement import with_rig
 from nerif.reconstruction.shared_settings import SharedSettings
 from nerif.reconstruction.symmetry import axis_of, check_views, with_axis
 from nerif.reconstruction.uncertainty.bootstrap import best_covered
@@ -22,7 +25,7 @@ from nerif.results.directory import ResultDirectory
 from nerif.results.metrics import WithheldRun
 from nerif.workflow.checkpointed import CheckpointedRun
 
-__all__ = ["AUTO", "MIN_VIEWS", "NONE", "CrossValidation", "with_halves", "withheld_views"]
+__all__ = ["AUTO", "MIN_VIEWS", "NONE", "CrossValidation", "ShortFit", "with_halves", "withheld_views"]
 
 AUTO: tuple[str, ...] = ("auto",)
 NONE: tuple[str, ...] = ("none",)
@@ -57,6 +60,22 @@ def with_halves(
         assert isinstance(reconstructor, SharedSettings)
         reconstructor = with_axis(reconstructor, axis.symmetry)
     return parts, reconstructor, withheld_views(names, parts.names)
+
+
+@dataclass(frozen=True)
+class ShortFit:
+    """The field of the short run, and its data with the cameras that it refined.
+
+    Parameters
+    ----------
+    field : reconstructed
+    training : data of the views that it used
+    withheld : data of the withheld view, its camera refined against the field if the run refined cameras
+    """
+
+    field: Field
+    training: Measurement
+    withheld: Measurement
 
 
 @dataclass(frozen=True)
@@ -110,8 +129,8 @@ class CrossValidation:
             return None
         other = best_covered(self.data.cameras)[1]
         with self.monitor.counting(f"predicting {name}"):
-            pair = reproject(result.field, self.data.select([name, other]), [name], result.device, model=result.model)
-            scores = evaluate_views(pair)
+            pair = with_rig(self.data.select([name, other]), result)
+            scores = evaluate_views(reproject(result.field, pair, [name], result.device, model=result.model))
         views, fitted = ([v for v in scores if v["withheld"] is flag] for flag in (True, False))
         entries = {"views": views, "fitted_views": fitted, "seconds": time.monotonic() - start}
         with self._directory.writing(SCORES) as path:
@@ -126,14 +145,13 @@ class CrossValidation:
         return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
 
     @property
-    def withheld(self) -> Measurement:
-        """The data of the withheld view."""
-        return self.data.select([self.view])
-
-    @property
-    def training(self) -> Measurement:
-        """The data of the other views."""
-        return self.data.without([self.view])
+    def fit(self) -> ShortFit | None:
+        """The field of the short run with its data; None if there is none."""
+        if not self._directory.has(FIELD):
+            return None
+        result = self._run.read()
+        data = with_rig(self.data, result)
+        return ShortFit(result.field, data.without([self.view]), data.select([self.view]))
 
     @property
     def _directory(self) -> ResultDirectory:
@@ -143,6 +161,6 @@ class CrossValidation:
     def _run(self) -> CheckpointedRun:
         short, _ = self.reconstructor.in_two()
         return CheckpointedRun(
-            self._directory, short, self.training, checkpoint_every=self.checkpoint_every,
+            self._directory, short, self.data.without([self.view]), checkpoint_every=self.checkpoint_every,
             monitor=self.monitor, restart=self.restart, limits=LIMITS,
         )  # fmt: skip

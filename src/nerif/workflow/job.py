@@ -30,6 +30,7 @@ from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.neural.parallel import Ranks
 from nerif.reconstruction.neural.schedule import Pace
 from nerif.reconstruction.progress import QUIET, Monitor
+from nerif.reconstruction.rig.posterior import RigPosterior
 from nerif.reconstruction.shared_settings import SharedSettings
 from nerif.reconstruction.sources import check_source
 from nerif.reconstruction.symmetry import axis_of, with_axis
@@ -173,12 +174,14 @@ class Job:
     method, initial, state : settings of the main run, and the field or state it starts from
     detail : how detail is to be added, if it is
     result : of the main run, once there is one
+    rig : the refined rig of the result, once its uncertainty is known
     posterior, detail_entries : of the field, once detail has been added; for metrics.json
     quantities : of the result, as volumes, once they are sampled
     """
 
     detail: Choice | None = None
     result: Reconstruction | None = None
+    rig: RigPosterior | None = None
     posterior: Posterior | None = None
     detail_entries: DetailEntries | None = None
     quantities: list[Volume]

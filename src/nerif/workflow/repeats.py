@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 from nerif.analysis.prediction import reproject
@@ -15,6 +14,7 @@ from nerif.geometry import Grid
 from nerif.physics.quantities import GasSettings, derive_all, masked_lines
 from nerif.reconstruction.base import Reconstruction, Reconstructor
 from nerif.reconstruction.progress import QUIET, Monitor
+from nerif.reconstruction.rig.posterior import RigPosterior
 from nerif.reconstruction.uncertainty.bootstrap import BootstrapDeviations, Maps, Original, Trials
 from nerif.reconstruction.uncertainty.deviations import Deviations, certainty
 from nerif.results.directory import ResultDirectory
@@ -55,9 +55,9 @@ class Members:
     out : directory with the main result
     trials : kind and number
     reconstructor : settings of the main result
-    training : data of the main result
+    training : data of the main result, with the calibrated cameras
+    rig : the refined rig of the main result, if it was refined
     start : initial field, or None
-    dependencies : further inputs; a trial with others is repeated
     checkpoint_every : s
     monitor : of the progress
     budget : time left for the trials
@@ -67,8 +67,8 @@ class Members:
     trials: Trials
     reconstructor: Reconstructor
     training: Measurement
+    rig: RigPosterior | None = None
     start: Field | None = None
-    dependencies: Mapping[str, str] = field(default_factory=dict)
     checkpoint_every: float = 60.0
     monitor: Monitor = QUIET
     budget: Budget = NO_LIMIT
@@ -79,15 +79,14 @@ class Members:
         Complete trials of an interrupted run are read; a diverged one is excluded.
         """
         say, start, word, count = self.monitor.say, time.monotonic(), "uncertainty", self.trials.members
-        base = Original(main, self.reconstructor, self.training, lambda f: self._projections(f, main))
+        base = Original(main, self.reconstructor, self.training, lambda *data: self._projections(main, *data), self.rig)
         deviations = BootstrapDeviations(quantities[0], gas.for_field(quantities[0]), base)
         diverged = []
         for number in range(1, count + 1):
             member = self.trials.member(number, base)
             settings = self.budget.allot(member.reconstructor, 1 / (count - number + 1))
             run = CheckpointedRun(
-                self.out.member(number), settings, member.measurement, self.start, self.dependencies,
-                self.checkpoint_every, self.monitor,
+                self.out.member(number), settings, member.measurement, self.start, self.checkpoint_every, self.monitor,
             )  # fmt: skip
             result = run(f"trial {number} of {count}")
             if result.outcome.reason == "interrupted":
@@ -105,6 +104,6 @@ class Members:
         entries["seconds"] = time.monotonic() - start
         write_deviations(self.out, self.monitor, quantities, deviations, entries)
 
-    def _projections(self, field: Field, main: Reconstruction) -> Maps:
+    def _projections(self, main: Reconstruction, field: Field, measurement: Measurement) -> Maps:
         with self.monitor.counting("projecting the field") as bar:
-            return reproject(field, self.training, (), main.device, bar, main.model).maps
+            return reproject(field, measurement, (), main.device, bar, main.model).maps

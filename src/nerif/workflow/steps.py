@@ -19,6 +19,7 @@ from nerif.analysis.prediction import reproject
 from nerif.analysis.surface import surface_map
 from nerif.analysis.verdict import verdict
 from nerif.common.conventions import unit_shown
+from nerif.data.measurement import Measurement
 from nerif.data.volume import describe, quantities_of
 from nerif.geometry import Grid
 from nerif.imaging.calibration.cameras_file import CalibratedCamera, write_cameras
@@ -28,8 +29,8 @@ from nerif.reconstruction.detail import COARSE, EARLY, ITERATIONS, SIGNIFICANT, 
 from nerif.reconstruction.files import FIELD, checkpoints
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.rig.parameters import refinement_lines, with_corrections
-from nerif.reconstruction.rig.posterior import with_posterior
-from nerif.reconstruction.rig.refinement import refit
+from nerif.reconstruction.rig.posterior import RigPosterior
+from nerif.reconstruction.rig.refinement import refit, with_rig
 from nerif.reconstruction.shared_settings import SHORT_RUN, SharedSettings
 from nerif.reconstruction.symmetry import axis_of
 from nerif.reconstruction.uncertainty.deviations import VOXELS, Deviations
@@ -108,25 +109,29 @@ class ChooseDetail(PipelineStep):
         job.detail = choice
 
     @staticmethod
-    def coarse(job: Job) -> Detail | None:
-        """Return the detail of the field of the cross-validation, on a coarse grid; None without that field."""
-        if job.validation is None or not job.out.cross_validation.has(FIELD):
+    def coarse(job: Job) -> tuple[Detail, Measurement] | None:
+        """Return the detail of the field of the cross-validation, on a coarse grid, and the data of its withheld view.
+
+        None without that field.
+        """
+        fit = None if job.validation is None else job.validation.fit
+        if job.validation is None or fit is None:
             return None
-        settings, training = job.reconstructor, job.validation.training
+        settings = job.validation.reconstructor
         assert isinstance(settings, SharedSettings)
-        return Detail(job.out.cross_validation.field()[0], training, settings, axis_of(settings, training), COARSE)
+        return Detail(fit.field, fit.training, settings, axis_of(settings, fit.training), COARSE), fit.withheld
 
     @staticmethod
     def choice(job: Job, left: float) -> Choice | None:
         """Return how detail is added, or None; `left`: seconds until the limit."""
-        validation, on = job.validation, job.run.detail == "on"
-        coarse = ChooseDetail.coarse(job)
-        if validation is None or coarse is None:
+        on, fit = job.run.detail == "on", ChooseDetail.coarse(job)
+        if fit is None:
             return Choice() if on else None
+        coarse, withheld = fit
         if coarse.residual < EARLY and not on:
             return None
         with job.monitor.counting("choosing the detail") as bar:
-            choice = choose(coarse, validation.withheld, math.inf if on else MOST_BLURRED * left, bar)
+            choice = choose(coarse, withheld, math.inf if on else MOST_BLURRED * left, bar)
         errors = f"{choice.before:.2f} sigma without it, {choice.after:.2f} with it"
         job.monitor.say(f"detail: the withheld view is predicted to {errors}")
         if choice.seconds > share(job, choice) * left and not on:
@@ -173,7 +178,7 @@ class AddDetail(PipelineStep):
         result, choice, settings, begin = the_result(job), job.detail, job.reconstructor, time.monotonic()
         assert choice is not None
         assert isinstance(settings, SharedSettings)
-        data = with_corrections(job.inputs.training, result.rig)
+        data = with_rig(job.inputs.training, result)
         coarse, fine = (Detail(result.field, data, settings, result.axis, size) for size in (COARSE, 1))
         before = fine.residual
         if before < SIGNIFICANT and job.run.detail == "auto":
@@ -260,12 +265,12 @@ class WriteRig(PipelineStep):
         out, result, monitor, measurement = job.out, the_result(job), job.monitor, job.measurement
         with monitor.counting("uncertainty of the rig") as bar:
             training = measurement.without(job.withheld)
-            rig = with_posterior(result.rig, training, result.field, result.settings, bar)
-        job.measurement = with_corrections(measurement, rig)
-        out.add_metrics(rig=rig)
+            job.rig = RigPosterior.of(result.rig, training, result.field, result.settings, bar)
+        job.measurement = with_corrections(measurement, job.rig.table)
+        out.add_metrics(rig=job.rig.table)
         with out.writing(CALIBRATION) as path:
             write_cameras(path, [CalibratedCamera.from_camera(c) for c in job.measurement.cameras])
-        for line in refinement_lines(rig):
+        for line in refinement_lines(job.rig.table):
             monitor.say(line)
         if not job.withheld:
             return
@@ -310,9 +315,10 @@ class WriteAxis(PipelineStep):
 
     @staticmethod
     def run(job: Job) -> None:
-        axis = the_result(job).axis
+        result = the_result(job)
+        axis, views = result.axis, with_corrections(job.inputs.all_views, result.rig)
         assert axis is not None
-        halves = asymmetry(job.inputs.all_views, axis.symmetry) if axis.symmetry.axial else []
+        halves = asymmetry(views, axis.symmetry) if axis.symmetry.axial else []
         job.out.add_metrics(axis=axis.record, asymmetry=halves)
         for line in (*axis.sentences, *(asymmetry_sentence(d) for d in halves)):
             job.monitor.say(line)
@@ -337,9 +343,9 @@ class DrawErrors(PipelineStep):
         begin, gas = time.monotonic(), job.run.gas.for_field(job.quantities[0])
         deviations = Deviations(job.quantities[0], gas, the_result(job).bodies)
         grid, ratio = Grid.of_resolution(job.measurement.box, VOXELS), 1.0
-        if job.detail is not None and job.validation is not None and (coarse := ChooseDetail.coarse(job)) is not None:
+        if job.detail is not None and (fit := ChooseDetail.coarse(job)) is not None:
             with job.monitor.counting("errors of the withheld view"):
-                ratio = job.detail.error_ratio(coarse, job.validation.withheld)
+                ratio = job.detail.error_ratio(*fit)
         for number in range(1, job.trials.members + 1):
             with job.monitor.counting(f"draw {number} of {job.trials.members}") as bar:
                 deviations.add(ratio * job.posterior.error(number, bar).sample(grid), grid)
@@ -364,11 +370,9 @@ class Bootstrap(PipelineStep):
         if result.outcome.failed:
             job.monitor.say(f"uncertainty: skipped: the main run {result.outcome.reason}")
             return
-        corrected = with_corrections(job.inputs.training, result.rig)  # trials do not refine the rig again
-        dependencies = {"start_from": str(job.run.start_from)}
         monitor = job.watching(withheld=False, looks=False)
         members = Members(
-            job.out, job.trials, job.reconstructor, corrected, job.start, dependencies, job.run.checkpoint_every,
+            job.out, job.trials, job.reconstructor, job.inputs.training, job.rig, job.start, job.run.checkpoint_every,
             monitor, job.budget,
         )  # fmt: skip
         members.add_to(result, job.quantities, job.run.gas)

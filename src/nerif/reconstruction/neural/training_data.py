@@ -111,7 +111,8 @@ class TrainingData:
         source = resolve_source(measurement, settings.source, preferred)
         final = of_source(measurement, source)
         check_target(final, settings.model)
-        self.device, self.fingerprint = resolve_device(settings.device), fingerprint(final, settings.open_faces)
+        self.device = resolve_device(settings.device)
+        self.fingerprint = fingerprint(final, settings.open_faces, settings.refine)
         self.box, self.n_ambient, self.quantity = measurement.box, measurement.n_ambient, measurement.quantity
         self.gauge_free = is_open(measurement)
         settings = settings.resolved_by(measurement)

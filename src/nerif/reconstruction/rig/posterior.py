@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -35,7 +35,7 @@ from nerif.reconstruction.voxels.operator import VoxelOperator
 from nerif.reconstruction.voxels.problem import Penalty, Problem
 from nerif.reconstruction.voxels.total_variation import at_faces, gradient_square
 
-__all__ = ["covariance", "with_posterior"]
+__all__ = ["RigPosterior", "covariance"]
 
 VOXELS, BASIS = 14, "cubic"  # along the longest edge of the box
 RIDGE = 1e-9  # of the mean curvature, for voxels that no ray crosses
@@ -46,47 +46,76 @@ SOFT = 0.05  # of the mean gradient, below which the penalty is quadratic
 Progress = Callable[[int, int], None]
 
 
-def with_posterior(
-    table: Sequence[RefinedView], measurement: Measurement, field: Field, settings: Mapping[str, Any],
-    on_voxel: Progress = lambda done, total: None,
-) -> list[RefinedView]:  # fmt: skip
-    """Return a table of refined parameters with their posterior standard deviations and the residuals of each view.
-
-    Rows of views that are not in the measurement or have no displacements are unchanged.
+@dataclass(frozen=True)
+class RigPosterior:
+    """A refined rig and the uncertainty of its parameters.
 
     Parameters
     ----------
-    table : see Refinement.table
-    measurement : with the calibrated cameras
-    settings : of the reconstruction
-    on_voxel : called with the finished and the total number of voxels
+    table : for each view its parameters with their posterior standard deviations, and its residuals
+    rig : the refined rig, of the views with displacements
+    covariance : of all refined parameters in units of their sigmas, view by view
     """
-    measurement = of_source(measurement, "auto", preferred="displacements")
-    rig, faces = Refinement.of_table(measurement, settings, table), tuple(settings["open_faces"])
-    posterior = covariance(rig, measurement, field, faces, on_voxel)
-    after = residuals(rig, measurement, field, faces)
-    rig.values = torch.zeros_like(rig.values)
-    before = residuals(rig, measurement, field, faces)
-    sigma_known = all(o.sigma is not None for o in measurement.observations)
-    k, rows = len(rig.columns), list[RefinedView]()
-    for row in table:
-        if row["name"] not in rig.names:
-            rows.append(row)
-            continue
-        v = rig.names.index(row["name"])
-        block, sigma = posterior[v * k : (v + 1) * k, v * k : (v + 1) * k], rig.sigma[v, rig.columns]
-        posterior_sigma = (block.diagonal().clamp(min=0).sqrt() * sigma).tolist()
-        slopes = rig.aside(v) * sigma  # px per sigma of each parameter
-        after_px, before_px = slopes @ block @ slopes.T, slopes @ slopes.T
-        share = torch.linalg.eigvals(torch.linalg.pinv(before_px, hermitian=True) @ after_px).real.max()
-        row = {
-            **row,
-            "uncertainty_reduction": 1 - float(share.clamp(0, 1).sqrt()),
-            "image_shift_sigma_px": float(torch.linalg.eigvalsh(after_px)[-1].clamp(min=0).sqrt()),
-            "posterior_sigma": dict(zip(row["values"], posterior_sigma, strict=True)),
-        }
-        rows.append({**row, "rms_before": float(before[v]), "rms_after": float(after[v])} if sigma_known else row)
-    return rows
+
+    table: list[RefinedView]
+    rig: Refinement
+    covariance: Float[Tensor, "m m"]
+
+    @classmethod
+    def of(
+        cls, table: Sequence[RefinedView], measurement: Measurement, field: Field, settings: Mapping[str, Any],
+        on_voxel: Progress = lambda done, total: None,
+    ) -> RigPosterior:  # fmt: skip
+        """Return the posterior of a rig.
+
+        Rows of views that are not in the measurement or have no displacements are unchanged.
+
+        Parameters
+        ----------
+        table : see Refinement.table
+        measurement : with the calibrated cameras
+        settings : of the reconstruction
+        on_voxel : called with the finished and the total number of voxels
+        """
+        measurement = of_source(measurement, "auto", preferred="displacements")
+        rig, faces = Refinement.of_table(measurement, settings, table), tuple(settings["open_faces"])
+        posterior = covariance(rig, measurement, field, faces, on_voxel)
+        after = residuals(rig, measurement, field, faces)
+        before = residuals(Refinement.of_table(measurement, settings, ()), measurement, field, faces)
+        sigma_known = all(o.sigma is not None for o in measurement.observations)
+        k, rows = len(rig.columns), list[RefinedView]()
+        for row in table:
+            if row["name"] not in rig.names:
+                rows.append(row)
+                continue
+            v = rig.names.index(row["name"])
+            block, sigma = posterior[v * k : (v + 1) * k, v * k : (v + 1) * k], rig.sigma[v, rig.columns]
+            posterior_sigma = (block.diagonal().clamp(min=0).sqrt() * sigma).tolist()
+            slopes = rig.aside(v) * sigma  # px per sigma of each parameter
+            after_px, before_px = slopes @ block @ slopes.T, slopes @ slopes.T
+            share = torch.linalg.eigvals(torch.linalg.pinv(before_px, hermitian=True) @ after_px).real.max()
+            row = {
+                **row,
+                "uncertainty_reduction": 1 - float(share.clamp(0, 1).sqrt()),
+                "image_shift_sigma_px": float(torch.linalg.eigvalsh(after_px)[-1].clamp(min=0).sqrt()),
+                "posterior_sigma": dict(zip(row["values"], posterior_sigma, strict=True)),
+            }
+            residual: Any = {"rms_before": float(before[v]), "rms_after": float(after[v])} if sigma_known else {}
+            rows.append({**row, **residual})
+        return cls(rows, rig, posterior)
+
+    def draw(self, generator: torch.Generator) -> list[RefinedView]:
+        """Return the table of a rig drawn from the posterior, with the common motions that no data determine."""
+        values, directions = torch.linalg.eigh(self.covariance)
+        white = torch.randn(len(values), generator=generator, dtype=torch.float64)
+        rig, drawn = self.rig, directions @ (values.clamp(min=0).sqrt() * white)
+        sigma = rig.sigma[:, rig.columns]
+        parameters = rig.values[:, rig.columns] + sigma * drawn.reshape(sigma.shape)
+        rows = dict(zip(rig.names, parameters.tolist(), strict=True))
+        return [
+            {**row, "values": dict(zip(row["values"], rows.get(row["name"], row["values"].values()), strict=True))}
+            for row in self.table
+        ]
 
 
 def covariance(

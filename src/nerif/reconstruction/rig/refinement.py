@@ -29,12 +29,21 @@ from nerif.fields.base import Field
 from nerif.forward.path_integral import PathIntegral, project
 from nerif.geometry import Box, Camera, Rays
 from nerif.geometry.pose import GEOMETRY, Corrections
+from nerif.reconstruction.base import Reconstruction
 from nerif.reconstruction.gauss_newton import Information
-from nerif.reconstruction.rig.parameters import GROUPS, NAMES, RefinedView, displaced, prior, refined_groups
+from nerif.reconstruction.rig.parameters import (
+    GROUPS,
+    NAMES,
+    RefinedView,
+    displaced,
+    prior,
+    refined_groups,
+    with_corrections,
+)
 from nerif.reconstruction.sources import of_source
 from nerif.reconstruction.target import Part, Target
 
-__all__ = ["MOMENTUM", "Refinement", "load_rig", "random_pixels", "refit", "rig_state"]
+__all__ = ["MOMENTUM", "Refinement", "load_rig", "random_pixels", "refit", "rig_state", "with_rig"]
 
 MOMENTUM = 0.6
 STEP_PX = 0.3  # movement of rays at the middle of the box for finite differences
@@ -386,3 +395,15 @@ def refit(
         pixels = random_pixels(target, len(measurement.names), i, per_view)
         rig.step(pixels, predict, target.sigma_known, momentum=0.0)
     return rig.table()
+
+
+def with_rig(measurement: Measurement, result: Reconstruction) -> Measurement:
+    """Return a measurement with the cameras of a result; those of views it did not use are refined against its field.
+
+    Whatever compares a field with data takes them from here: a field fits its own cameras, not the calibrated ones.
+    """
+    table, used = list(result.rig), {row["name"] for row in result.rig}
+    others = [name for name in measurement.names if name not in used]
+    if table and others:
+        table += refit(result.field, measurement.select(others), result.settings, result.device)
+    return with_corrections(measurement, table)

@@ -5,7 +5,9 @@
 
 Trial q'_j is reconstructed from simulated projections of the field q in the same cameras, to which the residuals of the
 reconstruction are added in blocks of random sign: noise of the right size and spatial correlation. The error of q'_j is
-then a sample of the error of q.
+then a sample of the error of q. If the rig was refined, the cameras of q are drawn from its posterior, and the trial,
+given the calibrated ones, refines a rig of its own: its error includes that of the rig, and common motions of all
+cameras, which no data determine.
 
 q is smoother than the truth, and detail that the reconstruction cannot resolve is absent from q. The loss is estimated
 from the share k^2 of the detail of q that the trials retain, with g as fine as the pixels. If they retain all of it,
@@ -39,6 +41,8 @@ from nerif.geometry import Camera, Grid
 from nerif.geometry.body import contained
 from nerif.physics.quantities import GasSettings
 from nerif.reconstruction.base import Reconstruction, Reconstructor
+from nerif.reconstruction.rig.parameters import with_corrections
+from nerif.reconstruction.rig.posterior import RigPosterior
 from nerif.reconstruction.uncertainty.deviations import VOXELS, Deviations, blurred
 
 __all__ = ["KINDS", "BootstrapDeviations", "Maps", "Member", "Original", "Trials", "best_covered"]
@@ -58,8 +62,9 @@ class Original:
 
     result: Reconstruction
     reconstructor: Reconstructor
-    measurement: Measurement
-    project: Callable[[Field], Maps]  # from a field to its projections into the views of the measurement
+    measurement: Measurement  # with the calibrated cameras
+    project: Callable[[Field, Measurement], Maps]  # from a field to its projections into the views of a measurement
+    rig: RigPosterior | None = None  # if the cameras were refined
 
     @cached_property
     def volume(self) -> Volume:
@@ -67,9 +72,19 @@ class Original:
         return replace(self.result, bodies=()).volume(Grid.of_resolution(self.measurement.box, VOXELS))
 
     @cached_property
+    def corrected(self) -> Measurement:
+        """The measurement with the refined cameras."""
+        return with_corrections(self.measurement, self.result.rig)
+
+    @cached_property
+    def spline(self) -> VoxelField:
+        """The spline through that volume."""
+        return VoxelField.through(self.volume.values.double(), self.volume.grid)
+
+    @cached_property
     def projections(self) -> Maps:
-        """The projections of a spline through that volume."""
-        return self.project(VoxelField.through(self.volume.values.double(), self.volume.grid))
+        """The projections of the spline."""
+        return self.project(self.spline, self.corrected)
 
 
 @dataclass(frozen=True)
@@ -101,10 +116,15 @@ class Trials:
         reconstructor = original.reconstructor
         if any(f.name == "seed" for f in dataclasses.fields(reconstructor)):  # type: ignore[arg-type]
             reconstructor = replace(reconstructor, seed=getattr(reconstructor, "seed") + number)  # type: ignore[type-var]  # noqa: B009
-        maps, data = {}, original.measurement
-        for o in data.observations:
-            projections = original.projections[o.technique.name].to(o.values)
-            maps[o.technique.name] = projections + (o.values - projections) * _signs(o.values, generator)
+        maps, data, there, projections = {}, original.measurement, original.corrected, original.projections
+        if original.rig is not None:
+            there = with_corrections(data, original.rig.draw(generator))
+            projections = original.project(original.spline, there)
+        for o, fitted, shifted in zip(*(m.observations for m in (data, original.corrected, there)), strict=True):
+            name = o.technique.name
+            residual = fitted.values - original.projections[name].to(o.values)
+            shift = o.values - shifted.values  # of the images
+            maps[name] = projections[name].to(o.values) + shift + residual * _signs(o.values, generator)
         sigmas = {o.technique.name: o.sigma for o in data.observations}
         return Member(reconstructor, data.observed(maps, sigmas), original.volume)
 
@@ -132,18 +152,6 @@ def _signs(like: Float[Tensor, "view row column c"], generator: torch.Generator)
     return fine[:, :height, :width].to(like)
 
 
-def _residuals(measurement: Measurement, projections: Maps) -> list[float]:
-    """Mean square residual of each technique, over sigma^2 where that is known."""
-    squares = []
-    for o in measurement.observations:
-        used = measurement.usable_for(o) & measurement.sees_box
-        residual = (o.values - projections[o.technique.name].to(o.values))[used].double()
-        if o.sigma is not None:
-            residual = residual / o.sigma[used].double()
-        squares.append(float(residual.square().mean()))
-    return squares
-
-
 class BootstrapDeviations(Deviations):
     """Standard deviations from the errors of trials.
 
@@ -167,12 +175,23 @@ class BootstrapDeviations(Deviations):
         fine = [float((v - blurred(v, grid, DETAIL_PX * self.pixel)).square().mean()) for v in both]
         if fine[1] > MIN_DETAIL * float(both[1].square().mean()):
             self.detail.append((fine[0], fine[1]))
-        residuals = _residuals(member.measurement, self.original.project(result.field))
+        residuals = self._residuals(result, with_corrections(member.measurement, result.rig))
         self.residual_ratios += [j / q for j, q in zip(residuals, self._original_residuals, strict=True) if q > 0]
 
     @cached_property
     def _original_residuals(self) -> list[float]:
-        return _residuals(self.original.measurement, self.original.project(self.original.result.field))
+        return self._residuals(self.original.result, self.original.corrected)
+
+    def _residuals(self, result: Reconstruction, measurement: Measurement) -> list[float]:
+        """Mean square residual of each technique, over sigma^2 where that is known."""
+        projections, squares = self.original.project(result.field, measurement), []
+        for o in measurement.observations:
+            used = measurement.usable_for(o) & measurement.sees_box
+            residual = (o.values - projections[o.technique.name].to(o.values))[used].double()
+            if o.sigma is not None:
+                residual = residual / o.sigma[used].double()
+            squares.append(float(residual.square().mean()))
+        return squares
 
     @property
     def lost(self) -> float:

@@ -112,7 +112,7 @@ class Descent:
         self.checkpoint: State
         self.ended: Outcome | None = None  # of the run that is resumed
         self.earlier_seconds, self.begin_time = 0.0, time.perf_counter()
-        self.fingerprint = fingerprint(measurement, settings.open_faces)
+        self.fingerprint = fingerprint(measurement, settings.open_faces, settings.refine)
         if resume is not None:
             self._restore(resume)
 
