@@ -6,8 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
+from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Ring
+from nerif.geometry.pose import GEOMETRY, Corrections
 from nerif.reconstruction.base import Step
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.progress import QUIET
@@ -47,6 +50,21 @@ def test_the_status_of_a_run(measurement, method, withhold, tmp_path, monkeypatc
     assert np.isfinite(look.values).all()
     valid = np.isfinite(look.measured)
     assert np.mean((look.predicted - look.measured)[valid] ** 2) < 2 * np.mean(look.measured[valid] ** 2)
+
+
+def test_the_view_is_seen_by_the_camera_that_is_refined(measurement, tmp_path, monkeypatch):
+    monkeypatch.setattr(live, "FIELD_DELAY", 0.0)
+    shifts = torch.zeros(4, len(GEOMETRY), dtype=torch.float64)
+    shifts[:, 4] = 2.0
+    knocked = replace(measurement, cameras=Corrections(measurement.cameras, -shifts).corrected)
+    rig = [{"name": name, "values": {"shift_y": 2.0}} for name in knocked.names]
+    field, looks = make_phantom("gaussians", measurement.box, 0), []
+    step = Step(1, 0.0, 0.0, 0.5, {"loss": 1.0}, 1.0, lambda: None, lambda: field)
+    for data, table in ((measurement, []), (knocked, rig)):
+        with Live(tmp_path, data, NeRIF()).watching(QUIET, withheld=False).training("training") as on_step:
+            on_step(replace(step, rig=lambda table=table: table))
+        looks.append(read_look(tmp_path).predicted)
+    np.testing.assert_allclose(*looks, atol=1e-4 * np.nanmax(np.abs(looks[0])))
 
 
 def test_no_status_unless_requested(measurement, tmp_path):

@@ -81,6 +81,7 @@ class Step:
     field : returns the present Field, valid until the method continues
     note : a line for the user on a change before this step, or ""
     pass_steps : average steps per pass over all pixels, of a training
+    rig : returns the present corrections of the cameras (refinement.py); none if they are not refined
     """
 
     step: int
@@ -93,6 +94,7 @@ class Step:
     field: Callable[[], Field]
     note: str = ""
     pass_steps: float = 1.0
+    rig: Callable[[], list[RefinedView]] = list
 
 
 OnStep = Callable[[Step], bool | None]

@@ -80,7 +80,8 @@ class GaussianProcess(SharedSettings):
             rays = len(posterior.problem.target) * posterior.count / max(now, 1e-9)
             count, state = int(history[-1]["step"]), first.state
             assert state is not None
-            step = Step(count, count, now, done, record, rays, lambda: state, lambda: posterior.splines)
+            field, rig = lambda: posterior.splines, lambda: first.rig
+            step = Step(count, count, now, done, record, rays, lambda: state, field, rig=rig)
             if on_step is not None and on_step(step):
                 stopped = "interrupted"
             elif self.time_limit and now >= self.time_limit:

@@ -31,6 +31,7 @@ from nerif.forward.registry import AUTO, forward_model
 from nerif.geometry import Box, Grid
 from nerif.reconstruction.base import OnStep, Reconstructor, Step, compose, sampled
 from nerif.reconstruction.progress import Monitor
+from nerif.reconstruction.rig.parameters import with_corrections
 from nerif.reconstruction.uncertainty.bootstrap import best_covered
 from nerif.results.directory import LIVE, LIVE_FIELD
 
@@ -164,7 +165,7 @@ class Live:
 
     @torch.no_grad()
     def _look(self, title: str, step: Step, withheld: bool) -> None:
-        m, field = self.measurement, step.field()
+        m, field = with_corrections(self.measurement, step.rig()), step.field()
         grid = Grid.of_resolution(m.box, COARSE_VOXELS)
         volume = sampled(field, grid, m.quantity, m.n_ambient, m.bodies, str(_device(field)))
         arrays: dict[str, np.ndarray] = {"values": volume.values.numpy()}
@@ -172,26 +173,28 @@ class Live:
             "title": title, "seconds": step.seconds, "quantity": m.quantity, "lower": m.box.lower,
             "upper": m.box.upper, "withheld": withheld, "view": "", "components": (), "unit": "",
         }  # fmt: skip
-        model = self._integral()
+        model = self._integral(m)
         if model is not None:
             observation, forward = model
-            arrays["measured"], arrays["predicted"] = self._maps(field, observation, forward)
+            arrays["measured"], arrays["predicted"] = self._maps(m, field, observation, forward)
             about |= {"view": self.view, "components": observation.components, "unit": observation.technique.unit}
         with OwnFiles(self.directory).writing(LIVE_FIELD) as path, atomic(path) as part:
             np.savez(part, about=np.array(json.dumps(about)), **arrays)  # type: ignore[arg-type]
 
-    def _integral(self) -> tuple[Observation, ForwardModel] | None:
+    def _integral(self, m: Measurement) -> tuple[Observation, ForwardModel] | None:
         """The first observation of the view that is an integral along rays."""
-        index = self.measurement.names.index(self.view)
-        for observation in self.measurement.observations:
-            forward = forward_model(observation.technique, self.measurement, self.model)
-            if forward.integral is forward and bool(self.measurement.usable_for(observation)[index].any()):
+        index = m.names.index(self.view)
+        for observation in m.observations:
+            forward = forward_model(observation.technique, m, self.model)
+            if forward.integral is forward and bool(m.usable_for(observation)[index].any()):
                 return observation, forward
         return None
 
-    def _maps(self, field: Field, observation: Observation, forward: ForwardModel) -> tuple[np.ndarray, np.ndarray]:
+    def _maps(
+        self, m: Measurement, field: Field, observation: Observation, forward: ForwardModel
+    ) -> tuple[np.ndarray, np.ndarray]:
         """The measured and the predicted view on a lattice of pixels."""
-        m, index = self.measurement, self.measurement.names.index(self.view)
+        index = m.names.index(self.view)
         camera = observation.technique.seen_by(m.cameras[index])
         height, width = camera.image_size
         step = -(-max(height, width) // MAX_PIXELS)

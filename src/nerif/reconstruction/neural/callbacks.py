@@ -410,7 +410,7 @@ class Progress(Callback):
         epoch_steps = len(trainer.data) * trainer.bins.edge**2 / trainer.sampler.pixels(trainer.sampler.mean_draw)
         step = Step(
             schedule.step, schedule.epoch, schedule.seconds, progress, values, speed, trainer.state_dict,
-            lambda: trainer.field, note, epoch_steps,
+            lambda: trainer.field, note, epoch_steps, trainer.data.rig,
         )  # fmt: skip
         stop = self.on_step is not None and bool(self.on_step(step))
         return bool(trainer.ranks.broadcast([float(stop)], trainer.device)[0])

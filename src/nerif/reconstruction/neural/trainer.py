@@ -148,7 +148,7 @@ class Trainer:
             device=str(self.device),
             state=state,
             quantity=self.data.quantity,
-            rig=[] if self.data.refinement is None else self.data.refinement.table(),
+            rig=self.data.rig(),
             axis=self.data.axis,
             bodies=self.data.measurement.bodies,
         )

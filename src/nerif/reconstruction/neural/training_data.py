@@ -29,7 +29,7 @@ from nerif.reconstruction.files import fingerprint
 from nerif.reconstruction.gauge import Gauge, is_open, with_gauge
 from nerif.reconstruction.neural.bins import coarsest_edge, withhold_pixels
 from nerif.reconstruction.neural.settings import TrainingSettings
-from nerif.reconstruction.rig.parameters import refined_groups
+from nerif.reconstruction.rig.parameters import RefinedView, refined_groups
 from nerif.reconstruction.rig.refinement import Refinement, load_rig, random_pixels, rig_state
 from nerif.reconstruction.sources import of_source, resolve_source, stages
 from nerif.reconstruction.symmetry import axis_of
@@ -171,6 +171,10 @@ class TrainingData:
             return part
         names = self.withheld_names if withheld else self.names
         return self.refinement.of(part, [self.refinement.names.index(name) for name in names])
+
+    def rig(self) -> list[RefinedView]:
+        """Return the present corrections of the cameras; none if they are not refined."""
+        return [] if self.refinement is None else self.refinement.table()
 
     def rig_pixels(self, seed: int) -> list[Part]:
         """Draw pixels for a step of the rig, with their calibrated rays; none in a stage without all views."""

@@ -35,6 +35,7 @@ from nerif.reconstruction.device import Cores, available_memory, peak_memory, re
 from nerif.reconstruction.files import check_fingerprint, fingerprint
 from nerif.reconstruction.gauge import Gauge, check_gauge, is_open, with_gauge
 from nerif.reconstruction.neural.bins import pixel_subset
+from nerif.reconstruction.rig.parameters import RefinedView
 from nerif.reconstruction.rig.refinement import MOMENTUM, Refinement, load_rig, random_pixels, rig_state
 from nerif.reconstruction.sources import of_source
 from nerif.reconstruction.symmetry import axis_of
@@ -289,7 +290,7 @@ class Descent:
         limit = self.settings.time_limit
         step = Step(
             self.iterations, float(self.iterations), self.seconds, self._progress(), losses, speed,
-            lambda: self.checkpoint, lambda: self._field(self.here),
+            lambda: self.checkpoint, lambda: self._field(self.here), rig=self._table,
         )  # fmt: skip
         if self.on_step is not None and self.on_step(step):
             raise _Stop("interrupted", f"stopped on request at {voxels:.0f} voxels; continue with --resume")
@@ -317,6 +318,9 @@ class Descent:
         return self.earlier_seconds + time.perf_counter() - self.begin_time
 
     # -- results ---------------------------------------------------------------------------------------------------
+
+    def _table(self) -> list[RefinedView]:
+        return [] if self.rig is None else self.rig.table()
 
     def _capture(self) -> State:
         assert self.x is not None
@@ -376,7 +380,7 @@ class Descent:
             device=str(self.device),
             state=state,
             quantity=self.measurement.quantity,
-            rig=[] if self.rig is None else self.rig.table(),
+            rig=self._table(),
             axis=self.axis,
             bodies=self.measurement.bodies,
         )
