@@ -114,12 +114,13 @@ class ChooseDetail(PipelineStep):
 
         None without that field.
         """
-        fit = None if job.validation is None else job.validation.fit
-        if job.validation is None or fit is None:
+        validation = job.validation
+        if validation is None or (fit := validation.fit) is None:
             return None
-        settings = job.validation.reconstructor
+        settings = validation.reconstructor
         assert isinstance(settings, SharedSettings)
-        return Detail(fit.field, fit.training, settings, axis_of(settings, fit.training), COARSE), fit.withheld
+        axis = axis_of(settings, validation.data.without([validation.view]))  # as for the field
+        return Detail(fit.field, fit.training, settings, axis, COARSE), fit.withheld
 
     @staticmethod
     def choice(job: Job, left: float) -> Choice | None:

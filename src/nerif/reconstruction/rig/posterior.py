@@ -108,9 +108,9 @@ class RigPosterior:
         """Return the table of a rig drawn from the posterior, with the common motions that no data determine."""
         values, directions = torch.linalg.eigh(self.covariance)
         white = torch.randn(len(values), generator=generator, dtype=torch.float64)
-        rig, drawn = self.rig, directions @ (values.clamp(min=0).sqrt() * white)
+        rig, change = self.rig, directions @ (values.clamp(min=0).sqrt() * white)
         sigma = rig.sigma[:, rig.columns]
-        parameters = rig.values[:, rig.columns] + sigma * drawn.reshape(sigma.shape)
+        parameters = rig.values[:, rig.columns] + sigma * change.reshape(sigma.shape)
         rows = dict(zip(rig.names, parameters.tolist(), strict=True))
         return [
             {**row, "values": dict(zip(row["values"], rows.get(row["name"], row["values"].values()), strict=True))}
