@@ -6,7 +6,6 @@ SciPy reads, and 5 with 64-bit data, which it does not.
 
 from __future__ import annotations
 
-import mmap
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -16,17 +15,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from nerif.common.conventions import InputError
+from nerif.common.hdf5 import open_hdf5
 
 if TYPE_CHECKING:
-    import h5py
     import xarray as xr
 
 CLASSIC, WIDE = (b"CDF\x01", b"CDF\x02"), b"CDF\x05"
 """First bytes of NetCDF-3 files."""
-HEAP = b"GCOL\x01\0\0\0"
-"""Signature and version of a global heap of HDF5."""
 
-__all__ = ["check_in_one_file", "opened", "reading", "values"]
+__all__ = ["opened", "reading", "values"]
 
 
 @contextmanager
@@ -51,7 +48,6 @@ def opened(path: str | os.PathLike[str], expected: str) -> Iterator[xr.Dataset]:
 
 
 def _dataset(path: Path) -> xr.Dataset:
-    import h5py
     import xarray as xr
 
     with path.open("rb") as content:
@@ -61,11 +57,9 @@ def _dataset(path: Path) -> xr.Dataset:
     if first == WIDE:
         remedy = f"nccopy -k 4 {path.name} {path.stem}4.nc"
         raise InputError(f"expected NetCDF-4 or classic, got NetCDF-3 with 64-bit data; convert: {remedy}", field=path)
-    check_heaps(path)
-    with h5py.File(path, "r") as file:
-        check_in_one_file(file)
+    with open_hdf5(path) as file:
         file.attrs.get("_nc3_strict")  # where this fails, h5netcdf leaves a half-made object that complains later
-    return xr.open_dataset(path, engine="h5netcdf", decode_times=False)
+    return xr.open_dataset(path, engine="h5netcdf", decode_times=False, phony_dims="sort")
 
 
 def values(variable: xr.DataArray) -> np.ndarray:
@@ -88,50 +82,3 @@ def reading(message: str) -> Iterator[None]:
     except Exception as error:  # libraries raise anything on damaged files
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(f"{message} ({reason})") from None
-
-
-def check_in_one_file(file: h5py.File) -> None:
-    """Raise OSError if a part of an HDF5 file, which may come from another person, is in another file."""
-    import h5py
-
-    def check(name: str, item: h5py.Group | h5py.Dataset) -> None:
-        if isinstance(item, h5py.Dataset):
-            names = [name] if item.external or item.is_virtual else []
-        else:
-            names = [key for key in item if isinstance(item.get(key, getlink=True), h5py.ExternalLink)]
-        if names:
-            raise OSError(f"'{names[0]}' is in another file; copy it into this one, as by h5repack")
-
-    check("/", file)
-    file.visititems(check)
-
-
-def check_heaps(path: Path) -> None:
-    """Raise OSError if a global heap does not end where its header states: the HDF5 library would loop forever.
-
-    A heap is a header of 16 bytes with its size, and objects: index (2 bytes), references (2), 4 free, size (8), data
-    up to a multiple of 8 bytes. Object 0 is the free space, whose size counts its own header.
-
-    Source: HDF5 File Format Specification 3.0, III.E.
-    """
-    if not path.stat().st_size:
-        return
-    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
-        start = content.find(HEAP)
-        while start >= 0:
-            if start % 8 == 0:
-                _check_heap(content, start)
-            start = content.find(HEAP, start + 8)
-
-
-def _check_heap(content: mmap.mmap, start: int) -> None:
-    header = 16
-    end = start + int.from_bytes(content[start + 8 : start + header], "little")
-    position = start + header
-    while position + header <= min(end, len(content)):
-        index = int.from_bytes(content[position : position + 2], "little")
-        size = int.from_bytes(content[position + 8 : position + header], "little")
-        length = header + -(-size // 8) * 8 if index else size
-        if length < header or position + length > end:
-            raise OSError("a global heap is damaged")
-        position += length

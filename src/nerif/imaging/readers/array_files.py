@@ -8,7 +8,7 @@ import numpy as np
 
 from nerif.common.conventions import InputError
 from nerif.common.files import ending
-from nerif.common.netcdf import check_in_one_file
+from nerif.common.hdf5 import open_hdf5
 from nerif.imaging.readers.frames import Frames
 
 __all__ = ["ArrayFrames", "Hdf5Frames"]
@@ -75,8 +75,7 @@ class Hdf5Frames(Frames):
 
         self._path, self._name = path, name
         try:
-            with h5py.File(path, "r") as file:
-                check_in_one_file(file)
+            with open_hdf5(path) as file:
                 dims: dict[str, int] = {}
                 file.visititems(lambda key, x: dims.update({key: x.ndim}) if isinstance(x, h5py.Dataset) else None)
                 self._key = _choose(dims, dataset.strip("/"), name)
@@ -104,8 +103,6 @@ class Hdf5Frames(Frames):
         return f"{self._name}:{self._key}" + (f" frame {i}" if self._stack else "")
 
     def load(self, i: int) -> np.ndarray:
-        import h5py
-
-        with h5py.File(self._path, "r") as file:
+        with open_hdf5(self._path) as file:
             image = file[self._key][i] if self._stack else file[self._key][()]
         return np.ascontiguousarray(image.T) if self._transposed else image

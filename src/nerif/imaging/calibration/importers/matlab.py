@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from nerif.common.conventions import InputError
-from nerif.common.netcdf import check_in_one_file
+from nerif.common.hdf5 import check_heaps, open_hdf5
 from nerif.imaging.calibration.cameras_file import CalibratedCamera, check_distortion, check_model, flat, numbers
 
 __all__ = ["read_matlab"]
@@ -49,11 +49,10 @@ def read_matlab(path: Path, pose: int = 1) -> list[CalibratedCamera]:
     import pymatreader
 
     try:
+        if h5py.is_hdf5(path):
+            check_heaps(path)  # pymatreader opens the file itself
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # unreadable objects are reported below
-            if h5py.is_hdf5(path):
-                with h5py.File(path, "r") as file:
-                    check_in_one_file(file)
             content = pymatreader.read_mat(str(path))
     except Exception as error:  # of SciPy and h5py, of many kinds
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
@@ -85,7 +84,7 @@ def _objects(path: Path, content: dict[str, Any]) -> list[str]:
         import h5py
 
         if h5py.is_hdf5(path):
-            with h5py.File(path) as file:
+            with open_hdf5(path) as file:
                 kinds = {name: bytes(item.attrs.get("MATLAB_class", b"double")) for name, item in file.items()}
             names += [name for name, kind in kinds.items() if not (name.startswith("#") or kind.startswith(READABLE))]
     return sorted({n for n in names if n and n != "None" and not n.startswith("__")})
