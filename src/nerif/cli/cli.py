@@ -127,6 +127,13 @@ def _run(words: list[str]) -> int:
         if is_closed_output(error):
             raise
         return _fail(f"{error.filename or 'file'}: {error.strerror or error}")
+    except (MemoryError, RuntimeError) as error:
+        from nerif.common.memory import is_out_of_memory
+
+        if not is_out_of_memory(error):
+            raise
+        remedy = "close other programs, or reduce --voxels, --batch, the views or their size"
+        return _fail(f"not enough memory ({str(error) or 'refused by the system'}); {remedy}")
     return 0
 
 

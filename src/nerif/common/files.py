@@ -18,8 +18,8 @@ from typing import Any
 from nerif.common.conventions import InputError
 
 __all__ = [
-    "WINDOWS", "atomic", "check_known", "ending", "is_file_name", "is_near", "local_path", "read_toml", "recorded",
-    "write_json", "write_toml", "written",
+    "WINDOWS", "atomic", "check_known", "ending", "is_file_name", "is_near", "local_path", "read_toml", "read_yaml",
+    "recorded", "write_json", "write_toml", "written",
 ]  # fmt: skip
 
 WINDOWS = os.name == "nt"
@@ -30,6 +30,7 @@ DRIVE = re.compile(r"[A-Za-z]:[\\/]|\\\\")
 RESERVED = re.compile(r'[<>:"|?*]|[. ]$|^(con|prn|aux|nul|com\d|lpt\d)(\.|$)', re.IGNORECASE)
 """Signs and names of no file of Windows; cam:1.png is there a hidden stream of the file cam."""
 ATTEMPTS_AFTER = (0.05, 0.1, 0.2, 0.4, 0.8)  # s, to rename a file over one that is open
+MOST_VALUES = 1_000_000  # of a YAML file
 ESCAPES = "in double quotes a backslash begins an escape: write paths with /, or in single quotes"
 
 written: list[Path] = []
@@ -134,6 +135,29 @@ def read_toml(path: str | os.PathLike[str], expected: str = "TOML file") -> dict
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, IsADirectoryError) as error:
         remedy = f"; {ESCAPES}" if str(error).startswith(("Unescaped", "Invalid hex value")) else ""
         raise InputError(f"not a TOML file ({error}){remedy}", field=path) from None
+
+
+def read_yaml(path: Path) -> Any:
+    """Read a YAML file whose aliases stand for at most MOST_VALUES values."""
+    import yaml
+
+    try:
+        content = yaml.safe_load(Path(path).read_bytes())
+        if _count(content, {}) > MOST_VALUES:
+            raise ValueError(f"its aliases stand for more than {MOST_VALUES:,} values")
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise InputError(f"not a YAML file ({' '.join(str(error).split())})", field=path) from None
+    return content
+
+
+def _count(value: Any, counts: dict[int, float]) -> float:
+    """Return the number of values in lists and tables, those of an alias each time; infinity if one contains itself."""
+    if not isinstance(value, dict | list):
+        return 1
+    if id(value) not in counts:
+        counts[id(value)] = math.inf
+        counts[id(value)] = sum(_count(v, counts) for v in (value.values() if isinstance(value, dict) else value))
+    return counts[id(value)]
 
 
 def write_toml(path: str | os.PathLike[str], table: Mapping[str, Any], head: str = "") -> None:

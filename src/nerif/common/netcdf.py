@@ -16,6 +16,7 @@ import numpy as np
 
 from nerif.common.conventions import InputError
 from nerif.common.hdf5 import open_hdf5
+from nerif.common.memory import check_memory
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -58,6 +59,9 @@ def _dataset(path: Path) -> xr.Dataset:
         remedy = f"nccopy -k 4 {path.name} {path.stem}4.nc"
         raise InputError(f"expected NetCDF-4 or classic, got NetCDF-3 with 64-bit data; convert: {remedy}", field=path)
     with open_hdf5(path) as file:
+        for name, item in file.items():
+            if getattr(item, "ndim", 0) == 1:  # coordinates, which xarray reads at once
+                check_memory(item.size * item.dtype.itemsize, path, f"{path}: variable '{name}'")
         file.attrs.get("_nc3_strict")  # where this fails, h5netcdf leaves a half-made object that complains later
     return xr.open_dataset(path, engine="h5netcdf", decode_times=False, phony_dims="sort")
 
@@ -65,6 +69,8 @@ def _dataset(path: Path) -> xr.Dataset:
 def values(variable: xr.DataArray) -> np.ndarray:
     """Read the numbers of a variable."""
     field = f"variable '{variable.name}'"
+    source = variable.encoding.get("source")
+    check_memory(variable.nbytes, None if source is None else Path(source), field)
     with reading(f"{field}: cannot be read; is the file damaged?"):
         numbers = np.asarray(variable.values)
     if numbers.dtype.kind not in "fiub":

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from nerif.common.conventions import COMPONENTS, DEFAULT_AMBIENT_FACES, InputError, parse_faces, whole
+from nerif.common.memory import check_memory
 from nerif.common.netcdf import reading, values
 from nerif.data.kinds import BOST, known_conventions
 from nerif.data.measurement import MASKS, Measurement, Region
@@ -245,6 +246,8 @@ def bodies_of(arrays: Mapping[str, np.ndarray], names: Sequence[str] = ()) -> tu
     """Return the bodies of the arrays of a file by their names (BODIES), at their poses."""
     vertices, faces = torch.from_numpy(arrays["body_vertices"]), torch.from_numpy(arrays["body_faces"]).long()
     number = torch.from_numpy(arrays.get("body_of_face", np.zeros(len(faces)))).long()
+    if not (len(number) == len(faces) and int(number.min()) >= 0 and int(number.max()) < len(faces)):
+        raise InputError("expected the number of a body for each triangle, got others", field="variable 'body_of_face'")
     count = int(number.max()) + 1
     rotations = torch.from_numpy(arrays.get("body_rotation", np.tile(np.eye(3), (count, 1, 1))))
     translations = torch.from_numpy(arrays.get("body_translation", np.zeros((count, 3))))
@@ -342,6 +345,7 @@ def _map(dataset: xr.Dataset, name: str) -> Tensor:
     variable, dimensions = dataset[name], variables()[name][0]
     is_mask = name in MASKS
     shape = [variable.sizes[d] for d in dimensions]
+    check_memory(math.prod(shape) * (1 if is_mask else 4), None, f"variable '{name}'")
     result = torch.empty(shape, dtype=torch.bool if is_mask else torch.float32)
     for i in range(shape[0]):
         numbers = values(variable.isel(view=i).transpose(*dimensions[1:]))

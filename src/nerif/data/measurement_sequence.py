@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Final
 from nerif.common.conventions import InputError
 from nerif.common.files import atomic
 from nerif.common.installation import install
+from nerif.common.memory import check_memory
 from nerif.common.netcdf import reading, values
 from nerif.data.kinds import SEQUENCE, known_conventions, reading_as
 from nerif.data.measurement import Measurement
@@ -36,6 +37,7 @@ ZARR_FORMAT: Final = 3
 WRITTEN = "written"
 """Variable (time,) that is 1 where a frame is complete; stores of other programs may lack it."""
 MEASUREMENTS = ("a measurement over time", WRITTEN)
+BYTES_OF_TIME = 64  # of an instant in a tuple
 MAX_FRAMES_SEARCHED = 20  # for one with all views
 
 
@@ -129,6 +131,7 @@ class MeasurementSequence:
                         f"variable '{name}': expected a leading dimension time, got {dimensions}", field=path
                     )
             count = dataset.sizes["time"]
+            check_memory(BYTES_OF_TIME * count, path, path)
             times = tuple(map(float, values(dataset["time"]).tolist() if "time" in dataset.coords else range(count)))
         if not _increase(times) or not math.isfinite(sum(times)):
             raise InputError(f"coordinate time: expected increasing instants in s, got {_short(times)}", field=path)
@@ -142,7 +145,9 @@ class MeasurementSequence:
         with _opened(self.path) as dataset, reading(f"{place}: cannot be read; is it damaged?"):
             if WRITTEN in dataset and not bool(dataset[WRITTEN][index]):
                 raise InputError("no data, or not written completely", field=place)
-            one = dataset.isel(time=index).load() if "time" in dataset.dims else dataset.load()
+            one = dataset.isel(time=index) if "time" in dataset.dims else dataset
+            check_memory(one.nbytes, self.path, place)
+            one = one.load()
         try:
             dimensions = variables()
             maps = [one[name] for name in _technique_maps(one) if one[name].dims == dimensions[name][0]]
@@ -280,7 +285,9 @@ def _check_arrays(path: Path) -> None:
 
     for metadata in sorted(path.glob("*/zarr.json")):
         with reading(f"{path}: not a readable Zarr store: {metadata.parent.name}"):
-            zarr.open(metadata.parent, mode="r")
+            array = zarr.open(metadata.parent, mode="r")
+        if getattr(array, "ndim", 0) == 1:  # coordinates, which xarray reads at once
+            check_memory(array.nbytes, path, f"{path}: {metadata.parent.name}")
 
 
 def _opened(path: Path) -> xr.Dataset:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 from nerif.common.conventions import InputError, ambient_index
 from nerif.common.files import atomic
+from nerif.common.memory import check_memory
 from nerif.common.netcdf import reading
 from nerif.data.kinds import SEQUENCE_RESULT, TRUE_SEQUENCE, Kind, check_kind, reading_as
 from nerif.data.measurement_sequence import ZARR_FORMAT, add_frames, check_store, require_zarr
@@ -145,7 +146,10 @@ class VolumeSequence:
         import numpy as np
 
         with reading(f"{self.path}: '{name}': cannot be read; is it damaged?"):
-            return np.asarray(self.array(name)[index])
+            array = self.array(name)
+            size = array.nbytes if isinstance(index, slice) else array.nbytes / array.shape[0]
+            check_memory(size, self.path, f"{self.path}: {name}")
+            return np.asarray(array[index])
 
     @property
     def view_scores(self) -> list[ViewScores]:

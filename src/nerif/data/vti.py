@@ -14,11 +14,13 @@ from torch import Tensor
 
 from nerif.common.conventions import InputError
 from nerif.common.files import atomic
+from nerif.common.memory import check_memory
 from nerif.geometry import Box, Grid
 
 __all__ = ["read_vti", "write_vti", "write_vtp"]
 
 BLOCK_BYTES = 1 << 20
+BYTES_OF_WORD = 32  # of a short word of a text once it is split, for each of its characters
 ZLIB_LEVEL = 5  # as in VTK
 
 
@@ -128,7 +130,7 @@ def read_vti(path: str | os.PathLike[str]) -> tuple[dict[str, Tensor], Grid, dic
     """
     content = Path(path).read_bytes()
     try:
-        return _Image(content).read()
+        return _Image(content, Path(path)).read()
     except InputError as error:
         raise error.inside(path) from None
     except (ElementTree.ParseError, ArithmeticError, LookupError, ValueError, TypeError, zlib.error) as error:
@@ -142,7 +144,8 @@ TYPES |= {f"{sign}Int{8 * n}": f"{code}{n}" for sign, code in (("", "i"), ("U", 
 class _Image:
     """The XML of a file, and the data appended to it."""
 
-    def __init__(self, content: bytes) -> None:
+    def __init__(self, content: bytes, path: Path) -> None:
+        self.path = path
         at = content.find(b"<AppendedData")
         self.appended = b""
         if at >= 0:
@@ -178,7 +181,9 @@ class _Image:
         for element in pieces[0].findall("PointData/DataArray"):
             if int(element.get("NumberOfComponents", "1")) == 1:
                 kind = self.kind(element)
-                values = np.frombuffer(self.data(element), kind).astype(kind.newbyteorder("="))
+                size = nx * ny * nz * kind.itemsize
+                check_memory(size, self.path)
+                values = np.frombuffer(self.data(element, size), kind).astype(kind.newbyteorder("="))
                 name = str(element.get("Name"))
                 if values.size != nx * ny * nz:
                     raise InputError(f"expected {nx} x {ny} x {nz} numbers, got {values.size}", field=f"array '{name}'")
@@ -186,7 +191,7 @@ class _Image:
                     values = values.astype(np.float64)
                 arrays[name] = torch.from_numpy(values.reshape(nz, ny, nx))
         for element in image.findall("FieldData/*") + self.root.findall("FieldData/*"):
-            name, data = str(element.get("Name")), self.data(element)
+            name, data = str(element.get("Name")), self.data(element, BLOCK_BYTES)
             if element.get("type") == "String":
                 attributes[name] = data.rstrip(b"\0").decode()
             elif len(data) == self.kind(element).itemsize:
@@ -196,19 +201,20 @@ class _Image:
     def kind(self, element: ElementTree.Element) -> np.dtype:
         return np.dtype(self.order + TYPES[element.get("type", "")])
 
-    def data(self, element: ElementTree.Element) -> bytes:
-        """Return the bytes of an array."""
+    def data(self, element: ElementTree.Element, most: int) -> bytes:
+        """Return the bytes of an array, at most as many as expected of it."""
         form, text = element.get("format", "ascii"), (element.text or "").strip()
         if form == "ascii":
-            return np.array(text.split(), dtype=np.float64).astype(self.kind(element)).tobytes()
+            check_memory(BYTES_OF_WORD * min(most, len(text)), None)
+            return np.array(text.split(maxsplit=most), dtype=np.float64).astype(self.kind(element)).tobytes()
         if form == "binary":
-            return self._decode(text.encode(), False)
+            return self._decode(text.encode(), False, most)
         offset = int(element.get("offset", "0"))
         if not 0 <= offset < len(self.appended):
             raise ValueError(f"data at {offset} are beyond the end")
-        return self._decode(self.appended[offset:], self.raw)
+        return self._decode(self.appended[offset:], self.raw, most)
 
-    def _decode(self, source: bytes, raw: bool) -> bytes:
+    def _decode(self, source: bytes, raw: bool, most: int) -> bytes:
         """Return the data after a header: the number of bytes, or number and sizes of compressed blocks.
 
         In base64, header and compressed data are separate groups of 4 characters for 3 bytes.
@@ -231,6 +237,9 @@ class _Image:
                 raise ValueError("an array is truncated")
             return content
         blocks, block_size, _ = words(3)
+        block_size = min(block_size, most + 1)
+        if (blocks - 1) * block_size > most:
+            raise ValueError(f"an array has {blocks} blocks of {block_size} bytes for {most} bytes")
         lengths = words(3 + blocks)[3:]
         compressed = part(sum(lengths), (3 + blocks) * size)
         contents, at = [], 0

@@ -154,9 +154,18 @@ class NetworkShape:
         return replace(self, octaves=min(self.octaves, max(finest, 1)))
 
     @classmethod
-    def of(cls, settings: dict[str, Any]) -> NetworkShape:
-        """Return the shape stored in a file; older files have no directions, which are then the axes."""
-        return cls(**{"directions": 3, **settings})
+    def of(cls, settings: dict[str, Any], weights: float = math.inf) -> NetworkShape:
+        """Return the shape stored in a file; older files have no directions, which are then the axes.
+
+        Parameters
+        ----------
+        weights : number of those in the file
+        """
+        shape = cls(**{"directions": 3, **settings})
+        inputs = encoded_width(shape.octaves, shape.directions)
+        if shape.width * (inputs + (shape.depth - 1) * shape.width + shape.head_width) > weights:
+            raise InputError(f"expected a network of the {weights} weights stored, got a larger one", field="network")
+        return shape
 
 
 class Network(nn.Module):

@@ -100,7 +100,10 @@ class Symmetry:
         """Return the symmetry of the entries of a file (dataclasses.asdict)."""
         x, y, z = entries["point"]
         frame = tuple((a, b, c) for a, b, c in entries["frame"])
-        return cls(entries["kind"], (x, y, z), frame, float(entries["rounding"]), int(entries["harmonics"]))
+        harmonics = int(entries["harmonics"])
+        if not 0 <= harmonics <= MAX_HARMONICS:
+            raise InputError(f"expected at most {MAX_HARMONICS}, got {harmonics}", field="harmonics")
+        return cls(entries["kind"], (x, y, z), frame, float(entries["rounding"]), harmonics)
 
     @property
     def axial(self) -> bool:

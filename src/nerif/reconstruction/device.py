@@ -25,6 +25,7 @@ from typing import Literal, NamedTuple, ParamSpec, TypeVar
 import torch
 
 from nerif.common.conventions import InputError
+from nerif.common.memory import free_memory
 from nerif.common.pauses import at_pauses
 
 __all__ = [
@@ -246,15 +247,7 @@ def available_memory(device: torch.device) -> int:
     """Return the free memory in bytes of a GPU, or of the machine within the limit of a container or job."""
     if device.type == "cuda":
         return int(torch.cuda.mem_get_info(device)[0])
-    import psutil
-
-    free = int(psutil.virtual_memory().available)
-    try:
-        limit = Path("/sys/fs/cgroup/memory.max").read_text(encoding="utf-8").strip()
-        used = int(Path("/sys/fs/cgroup/memory.current").read_text(encoding="utf-8"))
-        return free if limit == "max" else min(free, max(0, int(limit) - used))
-    except (OSError, ValueError):  # no such limit
-        return free
+    return free_memory()
 
 
 def peak_memory(device: torch.device) -> int:

@@ -245,7 +245,7 @@ def _field_of(tensors: dict[str, Tensor], about: dict[str, Any], box: Box, bodie
         grid = Grid(Box(tuple(lower), tuple(upper)), tuple(about["shape"]))
         planes = [VoxelField(c, grid, int(about["degree"])) for c in tensors["coefficients"]]
         return SymmetricVoxels(planes, Symmetry.from_entries(about["symmetry"]))
-    shape = NetworkShape.of(about["network"])
+    shape = NetworkShape.of(about["network"], sum(tensor.numel() for tensor in tensors.values()))
     if "symmetry" in about:  # in network coordinates
         network: Network = SymmetricNetwork(shape, Symmetry.from_entries(about["symmetry"]))
     else:

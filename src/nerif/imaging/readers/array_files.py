@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from nerif.common.conventions import InputError
 from nerif.common.files import ending
 from nerif.common.hdf5 import open_hdf5
-from nerif.imaging.readers.frames import Frames
+from nerif.common.memory import check_memory
+from nerif.common.npz import open_npz
+from nerif.imaging.readers.frames import Frames, check_count, check_size
+
+if TYPE_CHECKING:
+    import h5py
 
 __all__ = ["ArrayFrames", "Hdf5Frames"]
 
@@ -22,15 +29,18 @@ class ArrayFrames(Frames):
     def __init__(self, path: Path, name: str, dataset: str) -> None:
         try:
             if ending(path) == ".npy":
-                arrays = {"array": np.load(path, mmap_mode="r", allow_pickle=False)}
+                array = np.load(path, mmap_mode="r", allow_pickle=False)
+                _choose({"array": array.shape}, dataset, name)
             else:
-                with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-                    keys = [dataset] if dataset in archive.files else archive.files
-                    arrays = {key: archive[key] for key in keys}
+                with open_npz(path) as (archive, shapes):
+                    key = _choose(shapes, dataset, name)
+                    check_size(shapes[key][-2:], path, name=name)
+                    array = archive[key]
+        except InputError:
+            raise
         except Exception as error:
             raise InputError(f"cannot be read, truncated or damaged? ({error}); copy it again", field=name) from None
-        key = _choose({k: a.ndim for k, a in arrays.items()}, dataset, name)
-        self._array = arrays[key] if arrays[key].ndim == 3 else arrays[key][None]
+        self._array = array if array.ndim == 3 else array[None]
         self._name = name
         if not len(self._array):
             raise InputError("expected at least one frame, got none", field=name)
@@ -45,20 +55,21 @@ class ArrayFrames(Frames):
         return np.array(self._array[i])
 
 
-def _choose(dims: dict[str, int], dataset: str, name: str) -> str:
+def _choose(shapes: dict[str, tuple[int, ...]], dataset: str, name: str) -> str:
     """Return the dataset named, or the only one that can hold frames."""
-    candidates = [key for key, n in dims.items() if n in (2, 3)]
-    content = f"the file holds {', '.join(dims) or 'none'}"
+    candidates = [key for key, shape in shapes.items() if len(shape) in (2, 3)]
+    content = f"the file holds {', '.join(shapes) or 'none'}"
     if not dataset:
         if len(candidates) != 1:
             raise InputError(
                 f"expected one dataset of 2 or 3 dims, got {len(candidates)}; name it after ':' ({content})", field=name
             )
         return candidates[0]
-    if dataset not in dims:
+    if dataset not in shapes:
         raise InputError(f"no such dataset; {content}", field=f"{name}:{dataset}")
     if dataset not in candidates:
-        raise InputError(f"expected 2 or 3 dims (frame, row, column), got {dims[dataset]}", field=f"{name}:{dataset}")
+        dims = len(shapes[dataset])
+        raise InputError(f"expected 2 or 3 dims (frame, row, column), got {dims}", field=f"{name}:{dataset}")
     return dataset
 
 
@@ -76,14 +87,18 @@ class Hdf5Frames(Frames):
         self._path, self._name = path, name
         try:
             with open_hdf5(path) as file:
-                dims: dict[str, int] = {}
-                file.visititems(lambda key, x: dims.update({key: x.ndim}) if isinstance(x, h5py.Dataset) else None)
-                self._key = _choose(dims, dataset.strip("/"), name)
+                shapes: dict[str, tuple[int, ...]] = {}
+                file.visititems(lambda key, x: shapes.update({key: x.shape}) if isinstance(x, h5py.Dataset) else None)
+                self._key = _choose(shapes, dataset.strip("/"), name)
                 data = file[self._key]
                 self._stack, self._length = data.ndim == 3, len(data) if data.ndim == 3 else 1
+                check_size(data.shape[-2:], path, data.dtype.itemsize, name)
+                check_count(self._length, self._length * _part_stored(data), name)
                 bits = data.attrs.get("bits")
                 times = data.attrs.get("times", data.parent.get("times"))
-                times = None if times is None else np.array(times, dtype=float).ravel()
+                if times is not None:
+                    check_memory(times.size * times.dtype.itemsize, path, f"{name}: times")
+                    times = np.array(times, dtype=float).ravel()
                 self._transposed = MATLAB in data.attrs
         except InputError:
             raise
@@ -106,3 +121,9 @@ class Hdf5Frames(Frames):
         with open_hdf5(self._path) as file:
             image = file[self._key][i] if self._stack else file[self._key][()]
         return np.ascontiguousarray(image.T) if self._transposed else image
+
+
+def _part_stored(data: h5py.Dataset) -> float:
+    """The part of a dataset that is in the file: chunks may not have been written."""
+    chunks = math.prod(-(-n // m) for n, m in zip(data.shape, data.chunks, strict=True)) if data.chunks else 0
+    return data.id.get_num_chunks() / chunks if chunks else float(data.id.get_storage_size() > 0 or data.is_virtual)

@@ -15,7 +15,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from nerif.common.conventions import InputError
-from nerif.imaging.readers.frames import Frames
+from nerif.imaging.readers.frames import Frames, check_size
 from nerif.imaging.readers.packed import unpack
 
 __all__ = ["CineFrames"]
@@ -83,6 +83,7 @@ class CineFrames(Frames):
                 f"(compression {compression} and {packing}, {depth} bit); save the film uncompressed",
                 field=name,
             )
+        check_size((abs(height), width), path, name=name)
         self._shape, self._is_bottom_up = (abs(height), width), height > 0 and not packing
         self._packed, (self._dtype, self._channels) = PACKED.get(packing, 0), PIXELS[16 if packing else depth]
         bits = 12 if packing else settings["RealBPP"]

@@ -9,21 +9,25 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import chain
+from pathlib import Path
 from typing import TYPE_CHECKING, SupportsIndex
 
 import numpy as np
 
 from nerif.common.conventions import InputError
+from nerif.common.memory import check_memory
 from nerif.imaging.readers.mosaic import bayer_pattern, phase_means
 
 if TYPE_CHECKING:
     from nerif.imaging.readers.binning import Binning
 
-__all__ = ["Frames", "Layout", "SelectedFrames", "as_float", "check_size", "read_each", "size_in_words"]
+__all__ = ["Frames", "Layout", "SelectedFrames", "as_float", "check_count", "check_size", "read_each", "size_in_words"]
 
 LUMINANCE = np.array([0.299, 0.587, 0.114])  # of R, G, B (ITU-R BT.601)
 SAMPLE = 5  # frames that determine the layout
 MOST_PIXELS = 2**28  # of a frame, more than any sensor has: a damaged header must not fill the memory
+LEAST_STORED = 1e-3  # of the frames of a header; a copy that was interrupted before is not worth the others
 
 
 @dataclass(frozen=True)
@@ -103,8 +107,8 @@ class Frames(ABC):
         n = len(self)
         layouts: list[Layout] = []
         errors: list[InputError] = []
-        spread = (round(j * (n - 1) / (SAMPLE - 1)) for j in range(SAMPLE))
-        for k, i in enumerate(dict.fromkeys([*spread, *range(n)])):
+        spread = dict.fromkeys(round(j * (n - 1) / (SAMPLE - 1)) for j in range(SAMPLE))
+        for k, i in enumerate(chain(spread, (i for i in range(n) if i not in spread))):
             if layouts and k >= min(SAMPLE, n):
                 break
             try:
@@ -188,10 +192,26 @@ def as_float(values: np.ndarray) -> np.ndarray:
     return np.asarray(values, dtype=np.result_type(values.dtype, np.float32))
 
 
-def check_size(shape: Sequence[int]) -> None:
-    """Refuse a size in a file's header that no sensor has."""
+def check_size(shape: Sequence[int], path: Path, value: int = 1, name: str = "") -> None:
+    """Refuse a size in a file's header that no sensor has, or that the file cannot hold.
+
+    Parameters
+    ----------
+    shape : height and width, px, and possibly channels
+    value : bytes of a pixel
+    name : of the file in messages; none where the caller adds it
+    """
     if min(shape) < 1 or math.prod(shape) > MOST_PIXELS:
-        raise InputError(f"damaged header: expected a size of a sensor, got {size_in_words(shape)}; copy it again")
+        text = f"damaged header: expected a size of a sensor, got {size_in_words(shape)}; copy it again"
+        raise InputError(text, field=name)
+    check_memory(math.prod(shape) * value, path, name)
+
+
+def check_count(count: int, stored: float, name: str) -> None:
+    """Refuse a number of frames in a file's header of which the file holds next to none."""
+    if stored + 1 < LEAST_STORED * count:
+        text = f"expected {count:,} frames by the header, got {stored:,.0f} in the file; damaged? Copy it again"
+        raise InputError(text, field=name)
 
 
 def size_in_words(shape: Sequence[int]) -> str:

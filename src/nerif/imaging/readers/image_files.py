@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import re
+import struct
 import weakref
 import zlib
 from collections.abc import Callable, Iterator
@@ -19,7 +20,7 @@ from nerif.common.files import ending
 from nerif.common.image_names import RAW
 from nerif.common.installation import install
 from nerif.imaging.readers.camera_raw import CameraRaw
-from nerif.imaging.readers.frames import Frames, check_size
+from nerif.imaging.readers.frames import Frames, check_count, check_size
 from nerif.imaging.readers.image_file import ImageFile
 from nerif.imaging.readers.packed import unpack
 from nerif.imaging.readers.pco import B16, note_of_time_stamp
@@ -119,7 +120,11 @@ class Tiff(ImageFile):
             self._pages = list(range(len(pages)))
             if any(_is_reduced(pages[i]) for i in self._pages[:2]):  # of a long film, all pages take seconds
                 self._pages = [i for i in self._pages if not _is_reduced(pages[i])] or [0]
-            self._stack = len(pages) == 1 and self._tiff.is_imagej and _images_of_imagej(self._tiff)
+            self._stack = _images_of_imagej(self._tiff) if len(pages) == 1 and self._tiff.is_imagej else 0
+        if self._stack:
+            page: Any = pages[0]
+            check_size(page.shape, path, page.dtype.itemsize)
+            check_count(self._stack, path.stat().st_size / page.nbytes, "the stack of ImageJ")
 
     def __len__(self) -> int:
         return self._stack or len(self._pages) + self._is_truncated()
@@ -142,7 +147,7 @@ class Tiff(ImageFile):
             page: Any = self._tiff.pages[self._pages[i]]
             if 1 < page.bitspersample < 8:
                 raise _too_few_bits(page.bitspersample)
-            check_size(page.shape)
+            check_size(page.shape, self._path, page.dtype.itemsize)
             try:
                 image = self._read_packed(page) if _is_packed(page) else page.asarray()
             except (ValueError, NotImplementedError) as error:
@@ -246,6 +251,7 @@ class Png(ImageFile):
         chunks = _png_chunks(data)
         if not data.startswith(b"\x89PNG") or b"IEND" not in chunks:
             raise ValueError("no end of a PNG file" if data.startswith(b"\x89PNG") else "no PNG file")
+        check_size(struct.unpack(">2I", chunks[b"IHDR"][:8]), self._path)
         depth, palette = chunks[b"IHDR"][8], chunks[b"IHDR"][9] == PNG_PALETTE
         if 1 < depth < 8 and not palette:
             raise _too_few_bits(depth)
@@ -291,6 +297,7 @@ class Image(ImageFile):
         from PIL import Image as Pillow
 
         with Pillow.open(self._path, formats=("BMP", "JPEG")) as image:
+            check_size(image.size, self._path)
             palette = image.palette if image.mode == "P" else None
             return np.array(image if palette is None else image.convert(palette.mode))
 

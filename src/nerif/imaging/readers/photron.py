@@ -9,15 +9,13 @@ import numpy as np
 
 from nerif.common.conventions import InputError
 from nerif.common.files import ending
-from nerif.imaging.readers.frames import Frames, check_size
+from nerif.imaging.readers.frames import Frames, check_count, check_size
 from nerif.imaging.readers.packed import unpack
 
 __all__ = ["PhotronFrames"]
 
 NUMBERS = ("Color Bit", "EffectiveBit Depth", "Total Frame", "Image Height", "Image Width", "Record Rate(fps)")
 """Positive numbers that a .cih header must have, whole ones except the rate."""
-
-MOST_FRAMES = 2**26  # more than any camera's memory holds
 
 TAGS = {
     "Color Bit": "imageDataInfo/colorInfo/bit",
@@ -44,6 +42,9 @@ class PhotronFrames(Frames):
         cih = _header(header_path, Path(name).with_name(header_path.name).as_posix())
         self._stored, self._frames = int(cih["Color Bit"]), int(cih["Total Frame"])
         self._height, self._width = int(cih["Image Height"]), int(cih["Image Width"])
+        stored = self._path.stat().st_size * 8 / (self._height * self._width * self._stored)
+        check_size((self._height, self._width), self._path, name=name)
+        check_count(self._frames, stored, name)
         self.metadata_bits = min(int(cih["EffectiveBit Depth"]), self._stored)
         upper = self._stored == 16 and cih.get("EffectiveBit Side", "").lower() == "higher"
         self._shift = self._stored - self.metadata_bits if upper else 0
@@ -97,7 +98,7 @@ def _header(path: Path, name: str) -> dict[str, str]:
         text = path.read_bytes().decode("utf-8", errors="ignore")
         cih = _from_xml(text) if ending(path) == ".cihx" else _from_lines(text)
         *counts, rate = (float(cih[key]) if key == NUMBERS[-1] else int(cih[key]) for key in NUMBERS)
-        positive = min(*counts, rate) > 0 and counts[2] <= MOST_FRAMES
+        positive = min(*counts, rate) > 0
         float(cih.get("Save Step") or 1)
         kind, stored = cih["File Format"], int(counts[0])
     except (KeyError, ValueError, ElementTree.ParseError) as error:
@@ -111,14 +112,9 @@ def _header(path: Path, name: str) -> dict[str, str]:
         )
     if not positive:
         raise InputError(
-            f"expected {', '.join(NUMBERS)} above 0, and at most {MOST_FRAMES} frames, got "
-            f"{', '.join(cih[key] for key in NUMBERS)}",
+            f"expected {', '.join(NUMBERS)} above 0, got {', '.join(cih[key] for key in NUMBERS)}",
             field=name,
         )
-    try:
-        check_size((int(cih["Image Height"]), int(cih["Image Width"])))
-    except InputError as error:
-        raise error.inside(name) from None
     return cih
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from nerif.common.conventions import InputError
 from nerif.common.installation import install
-from nerif.imaging.readers.frames import Frames
+from nerif.imaging.readers.frames import Frames, check_size
 
 __all__ = ["VideoFrames"]
 
@@ -46,6 +46,7 @@ class VideoFrames(Frames):
                 context = stream and stream.codec_context
                 if context is None or not context.pix_fmt:
                     raise InputError("expected a film that FFmpeg can decode; export the frames as TIFF", field=name)
+                check_size((context.height, context.width), path, name=name)
                 tick = float(stream.time_base)
                 self._codec, properties = context.codec.name, int(context.codec.properties)
                 self._rate, self._expected = float(stream.average_rate or 0), stream.frames

@@ -16,7 +16,7 @@ import torch
 
 from nerif import __version__
 from nerif.common.conventions import InputError
-from nerif.common.files import check_known
+from nerif.common.files import check_known, read_yaml
 from nerif.common.installation import install
 
 if TYPE_CHECKING:
@@ -228,14 +228,9 @@ def _slurm_names() -> list[str]:
 
 def read_slurm(path: Path) -> dict[str, Any]:
     """Read the settings of a SLURM cluster, by default with one process and one thread per job."""
-    import yaml
-
     if not path.is_file():
         raise InputError(f"expected local, tcp://HOST:PORT or a YAML file for SLURM, got '{path}'", field="cluster")
-    try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise InputError(f"not a YAML file ({' '.join(str(error).split())})", field=path) from None
+    content = read_yaml(path)
     if not isinstance(content, dict):
         raise InputError(f"expected names and values such as 'queue: gpu', got {type(content).__name__}", field=path)
     settings = {str(k).replace("-", "_"): v for k, v in content.items()}

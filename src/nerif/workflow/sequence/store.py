@@ -184,8 +184,9 @@ class SequenceStore(VolumeSequence):
             raise InputError(f"frame {index} is not done; run nerif sequence again for missing frames", field=self.path)
         with reading(f"{self.path}: made by another version of nerif, or damaged; reconstruct it again"):
             network = _network(
-                self.attributes, self.grid.box, float(self.read("index_scale", index)), self.bodies(index)
-            )
+                self.attributes, self.grid.box, float(self.read("index_scale", index)), self.bodies(index),
+                self.array("weights").shape[-1],
+            )  # fmt: skip
         weights = torch.from_numpy(self.read("weights", index))
         scale, offset = (float(self.read(name, index)) for name in ("index_scale", "offset"))
         if len(weights) != sum(p.numel() for p in network.parameters()) or not bool(torch.isfinite(weights).all()):
@@ -216,9 +217,11 @@ class SequenceStore(VolumeSequence):
                 )
 
 
-def _network(attributes: dict[str, Any], box: Box, scale: float = 1.0, bodies: Sequence[Body] = ()) -> Network:
+def _network(
+    attributes: dict[str, Any], box: Box, scale: float = 1.0, bodies: Sequence[Body] = (), weights: float = math.inf
+) -> Network:
     """Return a network of the shape, symmetry and bounds of a store, for a field in units of `scale`."""
-    shape = NetworkShape.of(attributes["network"])
+    shape = NetworkShape.of(attributes["network"], weights)
     low, high = attributes.get("bounds", (None, None))  # no infinity in JSON
     bounds = in_units((-math.inf if low is None else low, math.inf if high is None else high), scale)
     symmetry = Symmetry.from_entries(attributes["symmetry"]) if attributes.get("symmetry") else None

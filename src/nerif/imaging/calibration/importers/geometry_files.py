@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from nerif.common.conventions import InputError
+from nerif.common.npz import open_npz
 from nerif.geometry.astra import camera_of, from_astra
 from nerif.geometry.tigre import from_tigre
 from nerif.imaging.calibration.cameras_file import CalibratedCamera
@@ -70,12 +71,14 @@ def _entries(path: Path) -> dict[str, Any]:
     """Return the arrays of a file; those of Python objects, such as None, are left out."""
     entries: dict[str, Any] = {}
     try:
-        with np.load(path, allow_pickle=False) as file:
-            for key in file.files:
+        with open_npz(path) as (archive, shapes):
+            for key in shapes:
                 try:
-                    entries[key] = file[key]
+                    entries[key] = archive[key]
                 except ValueError:  # an object
                     continue
+    except InputError:
+        raise
     except (OSError, ValueError, AttributeError, TypeError, EOFError, zipfile.BadZipFile):
         raise InputError("not a file of numpy.savez, or truncated", field=path) from None
     return entries

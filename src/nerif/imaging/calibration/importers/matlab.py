@@ -25,7 +25,8 @@ from typing import Any
 import numpy as np
 
 from nerif.common.conventions import InputError
-from nerif.common.hdf5 import check_heaps, open_hdf5
+from nerif.common.hdf5 import open_hdf5
+from nerif.common.memory import check_memory
 from nerif.imaging.calibration.cameras_file import CalibratedCamera, check_distortion, check_model, flat, numbers
 
 __all__ = ["read_matlab"]
@@ -49,11 +50,14 @@ def read_matlab(path: Path, pose: int = 1) -> list[CalibratedCamera]:
     import pymatreader
 
     try:
-        if h5py.is_hdf5(path):
-            check_heaps(path)  # pymatreader opens the file itself
+        if h5py.is_hdf5(path):  # pymatreader opens the file itself, and reads all of it
+            with open_hdf5(path) as file:
+                file.visititems(lambda name, item: check_memory(getattr(item, "nbytes", 0), path, f"{path}: {name}"))
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # unreadable objects are reported below
             content = pymatreader.read_mat(str(path))
+    except InputError:
+        raise
     except Exception as error:  # of SciPy and h5py, of many kinds
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(f"not a readable MATLAB file ({reason})", field=path) from None

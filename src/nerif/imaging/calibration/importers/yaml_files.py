@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from nerif.common.conventions import InputError
-from nerif.common.files import ending
+from nerif.common.files import ending, read_yaml
 from nerif.imaging.calibration.cameras_file import CalibratedCamera
 from nerif.imaging.calibration.importers.kalibr import is_kalibr, read_kalibr
 from nerif.imaging.calibration.importers.opencv import read_opencv, read_storage
@@ -71,10 +71,8 @@ def _content(file: Path) -> tuple[str, dict[str, Any]]:
 
 def _plain_yaml(file: Path) -> dict[str, Any]:
     """Return the entries of YAML without OpenCV's own types; empty for anything else."""
-    import yaml
-
     try:
-        values = yaml.safe_load(file.read_bytes())
-    except (yaml.YAMLError, UnicodeDecodeError, ValueError):
+        values = read_yaml(file)
+    except InputError:
         return {}
     return {str(key): value for key, value in values.items()} if isinstance(values, dict) else {}
