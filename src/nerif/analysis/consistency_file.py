@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -10,7 +9,7 @@ from typing import Any
 
 from nerif.analysis.consistency import Consistency, ViewAgreement
 from nerif.common.conventions import InputError
-from nerif.common.files import write_json
+from nerif.common.files import read_json, write_json
 from nerif.common.findings import Finding
 
 __all__ = ["CheckFindings", "read_findings", "write_findings"]
@@ -50,8 +49,8 @@ def write_findings(path: Path, findings: CheckFindings) -> None:
 
 def read_findings(path: Path) -> CheckFindings:
     """Read findings; InputError for a file of another kind."""
+    entries = read_json(path)
     try:
-        entries = json.loads(path.read_text(encoding="utf-8"))
         if not isinstance(entries, dict) or entries.get("format") != FORMAT:
             raise ValueError("another format")
         return CheckFindings(
@@ -61,7 +60,7 @@ def read_findings(path: Path) -> CheckFindings:
             tuple(map(str, entries["remarks"])),
             bool(entries["correctable"]),
         )
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
+    except (ValueError, KeyError, TypeError) as error:
         raise InputError(
             f"expected the findings of nerif check ({FORMAT}), got {_cause(error)}; check the measurement again",
             field=path,
@@ -84,6 +83,4 @@ def _finding(entries: dict[str, Any]) -> Finding:
 
 
 def _cause(error: Exception) -> str:
-    if isinstance(error, json.JSONDecodeError | UnicodeDecodeError):
-        return "a file that is no JSON"
     return f"no entry {error}" if isinstance(error, KeyError) else f"'{error}'"

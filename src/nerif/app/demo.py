@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import itertools
-import json
 from pathlib import Path
 from typing import Any
 
 from nerif.app.project import OWN
 from nerif.cli.commands.output import counting_bar, say
 from nerif.common.conventions import AMBIENT_INDEX, InputError
-from nerif.common.files import write_json
+from nerif.common.files import read_json, write_json
 from nerif.common.interruption import if_interrupted
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Ring
@@ -69,6 +68,6 @@ def render(folder: Path) -> None:
 def _is_complete(mark: Path) -> bool:
     """Whether all images are there: an interrupted start renders them again."""
     try:
-        return bool(json.loads(mark.read_text(encoding="utf-8"))["complete"])
+        return bool(read_json(mark)["complete"])
     except (OSError, ValueError, KeyError, TypeError):
         return False

@@ -35,7 +35,7 @@ from nerif.app.private import secret
 from nerif.app.project import OWN
 from nerif.app.runner import ENDED, JOB, LOG, STARTED
 from nerif.common.conventions import InputError
-from nerif.common.files import write_json
+from nerif.common.files import read_json, write_json
 from nerif.common.installation import command_line
 from nerif.common.interruption import interrupt
 from nerif.results.directory import RUN
@@ -356,7 +356,7 @@ def claim(where: Path, pid: int) -> bool:
 def _json(path: Path) -> dict[str, Any]:
     """Return the entries of a JSON file; none if it is missing, damaged or incomplete."""
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = read_json(path)
         json.dumps(content, ensure_ascii=False).encode()  # half a surrogate pair cannot be displayed
     except (OSError, ValueError, RecursionError):
         return {}

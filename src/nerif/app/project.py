@@ -147,7 +147,8 @@ class Project:
                 continue
             path = Path(entry.path)
             if not entry.is_dir(follow_symlinks=False):
-                yield path
+                if path.is_file() or path.is_dir() or not path.exists():  # not a pipe, which would be waited for
+                    yield path
             elif ending(path) == ".zarr" or _is_result(path):
                 yield path
                 yield from (p for p in (path / "measurement.nc",) if p.is_file())

@@ -45,7 +45,7 @@ class Workspace:
         if not self._drafts and self._file.is_file():
             try:
                 entries = json.loads(self._file.read_text(encoding="utf-8"), object_hook=_harmless)
-            except ValueError:  # damaged: only drafts are lost
+            except (ValueError, RecursionError):  # damaged: only drafts are lost
                 entries = {}
             drafts = entries if isinstance(entries, dict) else {}
             self._drafts = {name: values for name, values in drafts.items() if isinstance(values, dict)}

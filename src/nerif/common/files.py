@@ -18,8 +18,8 @@ from typing import Any
 from nerif.common.conventions import InputError
 
 __all__ = [
-    "WINDOWS", "atomic", "check_known", "ending", "is_file_name", "is_near", "local_path", "read_toml", "read_yaml",
-    "recorded", "write_json", "write_toml", "written",
+    "WINDOWS", "atomic", "check_file", "check_known", "ending", "is_file_name", "is_near", "local_path", "read_json",
+    "read_toml", "read_yaml", "recorded", "write_json", "write_toml", "written",
 ]  # fmt: skip
 
 WINDOWS = os.name == "nt"
@@ -126,13 +126,22 @@ def _remove(path: Path) -> None:
         path.unlink(missing_ok=True)
 
 
+def check_file(path: str | os.PathLike[str], expected: str = "file") -> None:
+    """Raise InputError if a path is no regular file: a pipe would be waited for, a device has no end."""
+    path = Path(path)
+    if not path.exists():
+        raise InputError(f"no such {expected}", field=path)
+    if not path.is_file():
+        kind = "a folder" if path.is_dir() else "a pipe, socket or device"
+        raise InputError(f"{kind}, no {expected}", field=path)
+
+
 def read_toml(path: str | os.PathLike[str], expected: str = "TOML file") -> dict[str, Any]:
     """Read a TOML file; `expected` is its content, for the message if there is none."""
+    check_file(path, expected)
     try:
         return tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
-    except FileNotFoundError:
-        raise InputError(f"no such {expected}", field=path) from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, IsADirectoryError) as error:
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         remedy = f"; {ESCAPES}" if str(error).startswith(("Unescaped", "Invalid hex value")) else ""
         raise InputError(f"not a TOML file ({error}){remedy}", field=path) from None
 
@@ -141,6 +150,7 @@ def read_yaml(path: Path) -> Any:
     """Read a YAML file whose aliases stand for at most MOST_VALUES values."""
     import yaml
 
+    check_file(path)
     try:
         content = yaml.safe_load(Path(path).read_bytes())
         if _count(content, {}) > MOST_VALUES:
@@ -175,6 +185,15 @@ def check_known(words: Iterable[str], names: Iterable[str], where: str, what: st
         if word not in names:
             near = difflib.get_close_matches(word, names, n=1, cutoff=0)[0]
             raise InputError(f"unknown {what} '{word}'; the nearest known one is '{near}'{more}", field=where)
+
+
+def read_json(path: Path) -> Any:
+    """Read a JSON file."""
+    check_file(path)
+    try:
+        return json.loads(path.read_text(encoding="utf-8-sig"))
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"not a JSON file, or truncated ({error})", field=path) from None
 
 
 def write_json(path: Path, entries: Mapping[str, Any]) -> None:

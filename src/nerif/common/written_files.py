@@ -6,7 +6,6 @@ written.json in the directory lists them: name, size in bytes, time of the last 
 from __future__ import annotations
 
 import hashlib
-import json
 import logging
 import os
 from collections.abc import Callable, Iterator, Sequence
@@ -14,7 +13,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from nerif.common.files import write_json
+from nerif.common.files import read_json, write_json
 
 __all__ = ["WARN", "WRITTEN", "OwnFiles", "remove_empty"]
 
@@ -88,7 +87,7 @@ class OwnFiles:
     def _entries(self) -> dict[str, dict[str, Any]]:
         """Entries of the list by name; names outside the directory are ignored."""
         try:
-            entries = json.loads((self.directory / WRITTEN).read_text(encoding="utf-8"))["files"]
+            entries = read_json(self.directory / WRITTEN)["files"]
             return {name: dict(entry) for name, entry in entries.items() if Path(name).name == name}
         except (OSError, ValueError, KeyError, TypeError, AttributeError):
             return {}

@@ -5,7 +5,6 @@ Readers open them within `reading_as`: the error for a file of another kind name
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from nerif.common.conventions import InputError
-from nerif.common.files import ending
+from nerif.common.files import ending, read_json
 from nerif.common.image_names import ARRAYS as NUMPY_AND_HDF5
 from nerif.common.image_names import FOLDER_SUFFIXES, SOURCES, SUFFIXES
 from nerif.common.installation import quoted, word_of
@@ -141,7 +140,7 @@ def _is_view(folder: Path) -> bool:
 
 def _of_store(metadata: Path) -> Kind | None:
     try:
-        attributes = json.loads(metadata.read_text(encoding="utf-8"))["attributes"]
+        attributes = read_json(metadata)["attributes"]
     except (ValueError, KeyError, TypeError):
         return None
     if known_conventions(attributes.get("Conventions")):

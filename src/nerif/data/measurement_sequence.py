@@ -5,7 +5,6 @@ Each frame has chunks of its own, so that several processes can read and write f
 
 from __future__ import annotations
 
-import json
 import math
 import os
 from collections.abc import Sequence
@@ -15,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from nerif.common.conventions import InputError
-from nerif.common.files import atomic
+from nerif.common.files import atomic, read_json
 from nerif.common.installation import install
 from nerif.common.memory import check_memory
 from nerif.common.netcdf import reading, values
@@ -61,7 +60,7 @@ def check_store(path: Path, kind: tuple[str, str]) -> None:
         return
     content, mark = kind
     try:
-        metadata = json.loads((path / "zarr.json").read_text(encoding="utf-8"))
+        metadata = read_json(path / "zarr.json")
         same_kind = mark in metadata["attributes"] or (path / mark / "zarr.json").is_file()
     except (OSError, ValueError, KeyError, TypeError):
         same_kind = False

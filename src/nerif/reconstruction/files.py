@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from nerif.common.conventions import InputError
-from nerif.common.files import atomic
+from nerif.common.files import atomic, check_file
 from nerif.common.written_files import OwnFiles
 from nerif.data.kinds import FIELD, RESULT, check_kind
 from nerif.data.measurement import Measurement
@@ -308,10 +308,11 @@ def read_tensors(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
     """Read tensors, and the other values, of a file of `write_tensors`."""
     from safetensors import SafetensorError, safe_open
 
+    check_file(path)
     try:
         with safe_open(path, framework="pt") as file:
             about = json.loads((file.metadata() or {})["nerif"])
             # copies: Windows replaces no file that is mapped into memory, as a checkpoint after --resume
             return {name: file.get_tensor(name).clone() for name in file.keys()}, about  # noqa: SIM118
-    except (SafetensorError, OSError, KeyError, ValueError) as error:
+    except (SafetensorError, OSError, KeyError, ValueError, RecursionError) as error:
         raise InputError(f"damaged or not written by nerif ({error})", field=path) from None

@@ -20,7 +20,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from nerif.common.files import atomic, write_json
+from nerif.common.files import atomic, read_json, write_json
+from nerif.common.netcdf import reading
+from nerif.common.npz import open_npz
 from nerif.common.written_files import OwnFiles
 from nerif.data.measurement import Measurement, Observation
 from nerif.data.volume import Volume, describe
@@ -215,7 +217,7 @@ def _device(field: Field) -> torch.device:
 def read_live(directory: Path) -> dict[str, Any]:
     """Return live.json of a result directory; empty if there is none."""
     path = directory / LIVE
-    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    return read_json(path) if path.is_file() else {}
 
 
 def read_look(directory: Path) -> Look | None:
@@ -223,7 +225,7 @@ def read_look(directory: Path) -> Look | None:
     path = directory / LIVE_FIELD
     if not path.is_file():
         return None
-    with np.load(path, allow_pickle=False) as file:
+    with reading(f"{path}: not a preview of the field, or truncated"), open_npz(path) as (file, _):
         about = json.loads(str(file["about"]))
         empty = np.zeros((0, 0, 0), np.float32)
         for name in ("lower", "upper", "components"):

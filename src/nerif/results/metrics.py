@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import asdict, dataclass, field
 from functools import cache
@@ -13,7 +12,7 @@ from pydantic import BeforeValidator, ConfigDict, TypeAdapter, ValidationError, 
 from typing_extensions import TypedDict
 
 from nerif.common.conventions import InputError
-from nerif.common.files import write_json
+from nerif.common.files import read_json, write_json
 from nerif.reconstruction.rig.parameters import RefinedView
 
 __all__ = [
@@ -248,10 +247,7 @@ class Metrics:
     @classmethod
     def read(cls, path: Path) -> Metrics:
         """Read a file."""
-        try:
-            entries = json.loads(path.read_text(encoding="utf-8"))
-        except ValueError as error:
-            raise InputError(f"not a JSON file of nerif, or truncated ({error})", field=path) from None
+        entries = read_json(path)
         try:
             return cls.of(entries)
         except InputError as error:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,7 +10,7 @@ from nerif.analysis.asymmetry import HALVES, withhold_half
 from nerif.analysis.evaluation import evaluate_views, rms_with_unit
 from nerif.analysis.prediction import reproject
 from nerif.common.conventions import InputError
-from nerif.common.files import write_json
+from nerif.common.files import read_json, write_json
 from nerif.data.measurement import Measurement
 from nerif.fields.base import Field
 from nerif.reconstruction.base import OnStep, Reconstruction, Reconstructor
@@ -142,7 +141,7 @@ class CrossValidation:
     def scores(self) -> WithheldRun | None:
         """Return prediction errors and duration, None if there are none yet."""
         path = self._directory / SCORES
-        return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
+        return read_json(path) if path.is_file() else None
 
     @property
     def fit(self) -> ShortFit | None:

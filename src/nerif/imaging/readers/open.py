@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from nerif.common.conventions import InputError
-from nerif.common.files import ending, local_path
+from nerif.common.files import check_file, ending, local_path
 from nerif.common.image_names import ARRAYS, FOLDER_SUFFIXES, HDF5, PHOTRON, SINGLE_SUFFIXES, SUFFIXES, VIDEO
 from nerif.imaging.readers.array_files import ArrayFrames, Hdf5Frames
 from nerif.imaging.readers.binning import binned_mask
@@ -97,6 +97,7 @@ def read_mask(
 
 def _open_files(files: list[Path], names: list[str], dataset: str = "") -> Frames:
     for path, name in zip(files, names, strict=True):
+        check_file(path)
         if ending(path) not in SUFFIXES:
             raise InputError(f"expected one of {READ}, got '{path.suffix}'; {EXPORT}", field=name)
         if len(files) > 1 and ending(path) in SINGLE_SUFFIXES:
@@ -132,7 +133,7 @@ def _find_files(path: Path, base: Path | None) -> list[Path]:
         if not files:
             inside = [p for p in path.iterdir() if not p.name.startswith(".")]
             raise InputError(f"expected images, got {_content(inside, base)}", field=label)
-    elif path.is_file():
+    elif path.exists():
         return [path]
     elif re.search(r"[*?]", str(path)):
         # *.tif is also *.TIF, as on Windows

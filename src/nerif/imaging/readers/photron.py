@@ -87,7 +87,7 @@ def _partner(path: Path, name: str, suffixes: tuple[str, ...]) -> Path:
     others = sorted(path.parent.iterdir(), key=lambda other: other.stem != path.stem)
     for suffix in suffixes:
         for other in others:
-            if other.stem.lower() == path.stem.lower() and ending(other) == suffix:
+            if other.stem.lower() == path.stem.lower() and ending(other) == suffix and other.is_file():
                 return other
     raise InputError(f"expected a {' or '.join(suffixes)} file of the same name beside it, got none", field=name)
 

@@ -16,7 +16,7 @@ import torch
 from annotated_types import Ge, Lt
 
 from nerif.common.conventions import InputError
-from nerif.common.files import ending
+from nerif.common.files import check_file, ending
 from nerif.common.settings import Positive, check_settings
 from nerif.data.kinds import ARRAYS, CALIBRATION, IMAGES, reading_as
 from nerif.geometry import Box, Lens, Plane
@@ -122,8 +122,8 @@ def import_cameras(
 
 def _read(path: Path, settings: ImportSettings, say: Callable[[str], None]) -> tuple[Sequence[CalibratedCamera], float]:
     """Return the cameras of a file, and the unit of length by its format, mm."""
-    if not path.exists():
-        raise InputError(f"no such file; expected a calibration ({' '.join(ENDINGS)})", field=path)
+    if not path.is_dir():
+        check_file(path, f"file; expected a calibration ({' '.join(ENDINGS)})")
     if path.is_dir() or ending(path) in YAML:
         return read_yaml_files(path, say)
     if ending(path) == ".mat":

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 import torch
 
 from nerif.common.conventions import InputError
+from nerif.common.files import read_json
 from nerif.imaging.calibration.cameras_file import CalibratedCamera, check_distortion, check_model, numbers
 
 __all__ = ["read_transforms"]
@@ -26,10 +26,7 @@ def read_transforms(path: Path) -> list[CalibratedCamera]:
     transform_matrix is camera to world with OpenGL's camera axes (x right, y up, z back); cx and cy count from the
     corner of the first pixel, whose centre is at 0.5. Entries of a frame override those above the frames.
     """
-    try:
-        content = json.loads(path.read_text(encoding="utf-8-sig"))
-    except (ValueError, UnicodeDecodeError):
-        raise InputError("not a JSON file, or truncated", field=path) from None
+    content = read_json(path)
     frames = content.get("frames") if isinstance(content, dict) else None
     if not isinstance(frames, list) or not frames or not all(isinstance(f, dict) for f in frames):
         raise InputError("expected NeRF's transforms.json with a list 'frames', got none", field=path)
