@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 
 import pytest
+import torch
 
+from bodies import cuboid
 from nerif.app.project import Contents, Project
+from nerif.cli.cli import main
 from nerif.common.conventions import InputError
-from nerif.common.files import read_json, read_toml, read_yaml
+from nerif.common.files import read_json, read_toml, read_yaml, write_toml
 from nerif.common.image_names import SUFFIXES
 from nerif.data.body_file import read_body
 from nerif.data.measurement import Measurement
 from nerif.data.volume_file import read_volume
+from nerif.data.vti import write_vti
+from nerif.geometry import Box, Grid, Ring
+from nerif.imaging.calibration.cameras_file import CalibratedCamera, write_cameras
 from nerif.imaging.calibration.importers.importers import import_cameras
 from nerif.imaging.readers.open import open_frames
+from nerif.imaging.readers.views import find_views
 from nerif.reconstruction.files import read_tensors
 from nerif.results.metrics import Metrics
 
@@ -61,3 +69,32 @@ def test_a_project_ignores_pipes(tmp_path):
     for name in ("a.toml", "a.nc", "a.vti"):
         os.mkfifo(tmp_path / name)
     assert Project(tmp_path).contents() == Contents()
+
+
+SEQUENCES = {"escape": "cam\x1b[31m1", "C1": "cam\x9b31m", "line": "cam\n1", "bidi": "cam\u202e1", "NUL": "a\0b"}
+
+
+@pytest.mark.parametrize("name", SEQUENCES.values(), ids=SEQUENCES)
+def test_names_have_no_control_characters(tmp_path, name):
+    camera = Ring(views=1, image_size=(6, 8)).cameras()[0]
+    one = CalibratedCamera.from_camera(camera)
+    write_cameras(tmp_path / "c.toml", [dataclasses.replace(one, name=name)])
+    write_toml(tmp_path / "views.toml", {"views": {name: {"flow": "a.tif"}}})
+    for make in (
+        lambda: dataclasses.replace(camera, name=name), lambda: import_cameras(tmp_path / "c.toml"),
+        lambda: find_views(tmp_path), lambda: dataclasses.replace(cuboid(), name=name),
+    ):  # fmt: skip
+        with pytest.raises(InputError, match="without control characters") as error:
+            make()
+        assert str(error.value).isascii()
+        assert str(error.value).isprintable()
+
+
+def test_other_texts_reach_the_terminal_as_escapes(tmp_path, capsys):
+    write_vti(tmp_path / "a.vti", {"\x9bq": torch.zeros(6, 5, 4)}, Grid(Box((0, 0, 0), (4, 5, 6)), (6, 5, 4)), {})
+    assert main(["info", str(tmp_path / "a.vti")]) == 0
+    assert main(["info", str(tmp_path / "\x1b[31mb.vti")]) == 2
+    output = capsys.readouterr()
+    assert r"\x9bq" in output.out
+    assert r"\x1b[31mb.vti" in output.err
+    assert not {"\x9b", "\x1b"} & {*output.out, *output.err}

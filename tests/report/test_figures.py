@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import base64
 import io
+from contextlib import nullcontext
 from dataclasses import replace
+from types import SimpleNamespace
 
 import imageio.v3 as iio
 import numpy as np
@@ -19,10 +21,15 @@ from nerif.data.measurement import Measurement
 from nerif.data.reprojection import Reprojection
 from nerif.data.volume import Volume
 from nerif.geometry import Box, Grid, Ring
+from nerif.imaging.calibration.result import ImageError
 from nerif.plotting import drawing
+from nerif.plotting.notebook import show_views
 from nerif.report import figures
+from nerif.report.calibration_figure import draw_errors
+from nerif.report.displacement_figure import save_displacements
 from nerif.report.isosurface import default_level, draw_isosurface, stl_of, surface_triangles
 from nerif.report.pages import JOURNALS, figures_of, residuals_over_sigma, slices, view
+from nerif.report.rig_figure import draw_two_sides
 from nerif.report.slice_images import bar_image, slice_aspect, slice_image
 from nerif.results.directory import Result, ResultDirectory
 from nerif.results.metrics import Metrics
@@ -181,6 +188,38 @@ def test_names_of_views_become_names_of_files(whole):
         FigureCanvasAgg(figure).draw()
         files.append(name)
     assert files[:4] == ["view_a_b", "view_a_b_1", "view_a_x__", "view_é_"]
+
+
+NAME = r"$\foo{$"
+"""Of a view or quantity: no mathematics."""
+SCORES = {"name": NAME, "withheld": False, "cc": 0.9, "rms": 0.1, "measured": "displacement", "unit": NAME}
+CORRECTIONS = {"name": NAME, "values": {"shift_x": 0.1}, "prior_sigma": {"shift_x": 0.2}}
+CAMERA = replace(Ring(views=1, image_size=(6, 8)).cameras()[0], name=NAME)
+ERRORS = SimpleNamespace(names=(NAME,), errors=[ImageError(NAME, "1", 0.1, 9, True, False)], rms=lambda name: 0.1)
+VIEWS = Measurement((CAMERA,), torch.zeros(1, 6, 8, 2), Box((-5, -5, -5), (5, 5, 5)), 1.00027)
+
+
+@pytest.mark.parametrize(
+    ("draw", "count"),
+    [
+        (lambda figure: figures.draw_view_scores(figure.subplots(), [SCORES]), 2),
+        (lambda figure: figures.draw_corrections(figure.subplots(), [CORRECTIONS]), 1),
+        (lambda figure: figures.draw_refined_rig(figure.subplots(), [CAMERA], [CORRECTIONS]), 1),
+        (lambda figure: draw_two_sides(figure, [CAMERA]), 2),
+        (lambda figure: draw_errors(figure.subplots(), ERRORS), 1),
+        (lambda figure: figure.subplots().set_title(drawing.label_of(NAME)), 1),
+        (lambda figure: show_views([NAME], torch.zeros(1, 6, 8, 1).numpy(), ("u",), "d [px]"), 0),
+        (lambda figure: save_displacements(io.BytesIO(), VIEWS), 0),
+    ],
+)
+def test_names_are_drawn_as_they_are(draw, count, monkeypatch):
+    monkeypatch.setattr("nerif.report.displacement_figure.atomic", nullcontext)
+    figure = Figure()
+    draw(figure)
+    canvas = io.StringIO()
+    with drawing.style():
+        figure.savefig(canvas, format="svg")
+    assert canvas.getvalue().count(NAME) >= count
 
 
 def test_the_colour_range_excludes_a_few_outliers(volume):

@@ -149,7 +149,9 @@ def _files_written() -> str:
 
 
 def _fail(message: str) -> int:
-    print("nerif: " + " ".join(message.split()), file=sys.stderr)
+    from nerif.common.conventions import printable
+
+    print("nerif: " + printable(" ".join(message.split())), file=sys.stderr)
     return 2
 
 

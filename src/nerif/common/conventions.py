@@ -6,6 +6,7 @@ Lengths are millimetres, image quantities pixels, angles radians, times seconds.
 from __future__ import annotations
 
 import math
+import unicodedata
 from typing import SupportsFloat
 
 __all__ = [
@@ -18,7 +19,9 @@ __all__ = [
     "STATISTICS",
     "InputError",
     "ambient_index",
+    "check_name",
     "parse_faces",
+    "printable",
     "unit_shown",
     "whole",
     "with_unit",
@@ -46,6 +49,9 @@ STATISTICS = {
 
 LARGEST_INDEX = 4.0
 """Upper limit of the refractive index of gases, liquids and glasses."""
+
+CONTROL = ("Cc", "Cf", "Cs", "Zl", "Zp")
+"""Unicode categories of control, format and line characters."""
 
 LARGEST_LENGTH = 1e7
 """Ten kilometres in mm: a longer length is taken for an error of unit."""
@@ -76,6 +82,22 @@ def ambient_index(value: object, name: str = "n_ambient") -> float:
     if not isinstance(value, SupportsFloat) or not 0.9 < float(value) < LARGEST_INDEX:
         raise InputError(f"expected a refractive index such as 1.00027, got {value}", field=name)
     return float(value)
+
+
+def printable(text: str) -> str:
+    """Return a text whose control characters, but for line breaks and tabs, are escapes: a terminal obeys them."""
+    return "".join(c if c in "\n\t" or unicodedata.category(c) not in CONTROL else ascii(c)[1:-1] for c in text)
+
+
+def check_name(name: str, of: str) -> None:
+    """Refuse a name with control characters, which would reach terminals, reports and names of files.
+
+    Parameters
+    ----------
+    of : what has the name, such as "view"
+    """
+    if any(unicodedata.category(c) in CONTROL for c in name):
+        raise InputError(f"expected a name without control characters, got {name!a}", field=of)
 
 
 def whole(value: object, name: str) -> int:

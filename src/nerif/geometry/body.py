@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from nerif.common.arrays import Matrix3, Points, Values
-from nerif.common.conventions import InputError
+from nerif.common.conventions import InputError, check_name
 from nerif.geometry.camera import Camera
 from nerif.geometry.grid import Box
 from nerif.geometry.rays import Rays
@@ -65,6 +65,7 @@ class Body:
             if not valid:
                 raise InputError(f"expected {expected}, got {got}", field=self.name)
 
+        check_name(self.name, "body")
         vertices, faces = self.vertices, self.faces
         check(vertices.ndim == 2 and vertices.shape[1] == 3, "vertices (n, 3) in mm", tuple(vertices.shape))
         shape = tuple(faces.shape)

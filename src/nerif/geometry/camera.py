@@ -20,7 +20,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerif.common.arrays import Matrix3, Pixels, Points, Values
-from nerif.common.conventions import LARGEST_LENGTH, InputError
+from nerif.common.conventions import LARGEST_LENGTH, InputError, check_name
 from nerif.geometry.distortion import UPRIGHT, Array, from_sensor, to_sensor
 from nerif.geometry.lens import Lens, LensDiscs
 from nerif.geometry.rays import BackgroundPoints, Rays
@@ -197,6 +197,7 @@ class Camera:
             if not valid:
                 raise InputError(f"expected {expected}, got {got}{remedy}", field=f"{name} of view '{self.name}'")
 
+        check_name(self.name, "view")
         plane, lens, kind, k, r = self.background, self.lens, self.projection, self.intrinsics, self.rotation
         for name, value, limit, unit in (
             ("intrinsics", k, 1e7, " px"),

@@ -34,6 +34,7 @@ __all__ = [
     "label_of",
     "map_colours",
     "map_range",
+    "plain",
     "plotted_quantities",
     "plotted_values",
     "style",
@@ -102,13 +103,18 @@ def style(size: float = 7.0) -> Iterator[None]:
         yield
 
 
+def plain(text: str) -> str:
+    """Return a name from a file as Matplotlib shows it unchanged, also in legends: without mathematics."""
+    return text.replace("$", r"\$")
+
+
 def label_of(quantity: str) -> str:
     """Return the label of a colour bar with its unit, also for statistics such as density_std."""
     base, _, statistic = quantity.rpartition("_")
     if statistic in STATISTICS and base in LABELS:
         name, unit = LABELS[base]
         return f"{STATISTICS[statistic]} of {name} [{unit}]"
-    name, unit = LABELS.get(quantity, (quantity, "1"))
+    name, unit = LABELS.get(quantity, (plain(quantity), "1"))
     return f"{name} [{unit}]"
 
 

@@ -20,6 +20,7 @@ from nerif.plotting.drawing import (
     draw_slices,
     label_of,
     map_range,
+    plain,
     plotted_values,
     style,
 )  # fmt: skip
@@ -132,7 +133,7 @@ def show_views(
             for row, component in enumerate(components):
                 axes = draw_map(grid[row, column], maps[view][..., row], limits)
                 axes.set(xticks=[], yticks=[], xlabel="", ylabel="" if column else component)
-            grid[0, column].set_title(names[view], parse_math=False)
+            grid[0, column].set_title(plain(names[view]))
         add_colour_bar(list(grid.ravel()), label)
 
     return image(draw, min(9.5, 1.6 + 1.1 * len(indices)), 0.5 + 1.15 * len(components))

@@ -9,6 +9,7 @@ import numpy as np
 
 from nerif.common.files import atomic
 from nerif.imaging.calibration.result import Calibration
+from nerif.plotting.drawing import plain
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -28,7 +29,7 @@ def draw_errors(axes: Axes, calibration: Calibration) -> Axes:
             colour = REJECTED if not e.used else (ON_BACKGROUND if e.background else FREE)
             axes.bar(x, e.rms, color=colour, hatch="" if e.used else "//", width=0.9)
         axes.plot([at[0] - 0.5, at[-1] + 0.5], [calibration.rms(name)] * 2, color="black", linewidth=1)
-        ticks.append((at.mean(), name))
+        ticks.append((at.mean(), plain(name)))
         position = at[-1] + 3
         if k < len(calibration.names) - 1:
             axes.axvline(at[-1] + 1.5, color="0.85", linewidth=0.8)
@@ -64,7 +65,7 @@ def save_errors(path: Path, calibration: Calibration) -> None:
     for i, name in enumerate(calibration.names):
         axes = figure.add_subplot(grid[1 + i // columns, i % columns])
         draw_residuals(axes, calibration.residuals[i], calibration.sizes[i], length / max(float(typical), 1e-9))
-        axes.set_title(f"{name}: {calibration.rms(name):.3f} px rms", fontsize=8)
+        axes.set_title(f"{plain(name)}: {calibration.rms(name):.3f} px rms", fontsize=8)
     figure.supxlabel(f"column and row [px]; an arrow of {length:.0f} px is a residual of {typical:.3f} px", fontsize=8)
     with atomic(path) as part:
         figure.savefig(part, dpi=130)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from nerif.common.files import atomic
 from nerif.data.measurement import Measurement
-from nerif.plotting.drawing import draw_map
+from nerif.plotting.drawing import draw_map, plain
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -38,7 +38,7 @@ def _grid(views: int, rows_per_view: int, height: float) -> tuple[Figure, Any]:
 
 def _label(axes: Axes, title: str, row: bool, column: bool) -> None:
     axes.set_facecolor("0.75")
-    axes.set_title(title, fontsize=8)
+    axes.set_title(plain(title), fontsize=8)
     axes.tick_params(labelsize=6)
     axes.set_xlabel("column [px]" if column else "", fontsize=7)
     axes.set_ylabel("row [px]" if row else "", fontsize=7)

@@ -10,7 +10,7 @@ import numpy as np
 from nerif.analysis.metrics import LEVELS
 from nerif.data.volume import Volume
 from nerif.geometry import Camera
-from nerif.plotting.drawing import COLOURS, label_of, plotted_quantities, plotted_values
+from nerif.plotting.drawing import COLOURS, label_of, plain, plotted_quantities, plotted_values
 from nerif.reconstruction.rig.parameters import RefinedView
 from nerif.reconstruction.uncertainty.deviations import TAILS
 from nerif.results.metrics import ViewScores
@@ -85,15 +85,15 @@ def draw_view_scores(axes: Axes, views: list[ViewScores]) -> Axes:
     names = []
     for place, view in enumerate(views):
         value, withheld = view["rms_over_sigma"] if in_sigma else view["rms"], view["withheld"]
-        name = f"{view['name']}{', ' + view['measured'] if several else ''}"
+        name = f"{plain(view['name'])}{', ' + view['measured'] if several else ''}"
         names.append(f"{name}\nwithheld" if withheld else name)
         if np.isfinite(value):
             colour, hatch = (COLOURS["orange"], "///") if withheld else (COLOURS["blue"], None)
             axes.bar(place, value, width=0.7, color=colour, hatch=hatch, edgecolor="white", linewidth=0)
     if in_sigma:
         axes.axhline(1, color=COLOURS["grey"], linewidth=0.8, linestyle="--")
-    axes.set_xticks(range(len(views)), names, rotation=90, parse_math=False)
-    axes.set_ylabel("rms error / noise [1]" if in_sigma else f"rms error [{views[0]['unit']}]")
+    axes.set_xticks(range(len(views)), names, rotation=90)
+    axes.set_ylabel("rms error / noise [1]" if in_sigma else f"rms error [{plain(views[0]['unit'])}]")
     return axes
 
 
@@ -183,7 +183,7 @@ def draw_corrections(axes: Axes, table: Sequence[RefinedView]) -> Axes:
         values = [row["values"][names[n]] / prior[n] for n in refined]
         posterior = [row.get("posterior_sigma", {}).get(names[n], 0.0) / prior[n] for n in refined]
         place = np.array(refined) + 0.7 * ((i + 0.5) / len(table) - 0.5)
-        axes.errorbar(place, values, yerr=posterior, fmt="o", ms=3, lw=0.8, label=row["name"])
+        axes.errorbar(place, values, yerr=posterior, fmt="o", ms=3, lw=0.8, label=plain(row["name"]))
     for limit in (-3, 3):
         axes.axhline(limit, color="0.6", lw=0.8, ls="--")
     axes.axhline(0, color="0.6", lw=0.8)
@@ -217,7 +217,7 @@ def draw_refined_rig(axes: Axes, cameras: Sequence[Camera], table: Sequence[Refi
         axes.plot(*np.stack([before[i], before[i] + 0.3 * extent * sights[i]])[:, :2].T, color=colour, lw=0.6)
         end = before[i] + scale * shifts[i]
         axes.annotate("", end[:2], before[i, :2], arrowprops={"arrowstyle": "->", "color": colour})
-        axes.annotate(camera.name, before[i, :2], xytext=(4, 4), textcoords="offset points", fontsize=6)
+        axes.annotate(plain(camera.name), before[i, :2], xytext=(4, 4), textcoords="offset points", fontsize=6)
     axes.margins(0.2)
     axes.set_aspect("equal", adjustable="datalim")
     axes.set(xlabel="x [mm]", ylabel="y [mm]")

@@ -26,6 +26,7 @@ from nerif.plotting.drawing import (
     draw_map,
     label_of,
     map_range,
+    plain,
     plotted_quantities,
     plotted_values,
 )
@@ -166,7 +167,7 @@ def view(reprojection: Reprojection, i: int, width: float) -> Figure:
             maps.append((o, np.where(mask, o.values[inside].numpy(), np.nan), predicted, sigma))
     figure = (_lines if min(height_px, width_px) <= MAX_LINES else _maps)(maps, width)
     withheld = ", withheld" if measurement.names[i] in reprojection.withheld else ""
-    figure.suptitle(f"view {measurement.names[i]}{withheld}", parse_math=False)
+    figure.suptitle(f"view {plain(measurement.names[i])}{withheld}")
     return figure
 
 

@@ -14,6 +14,7 @@ from jaxtyping import Float
 
 from nerif.common.files import atomic
 from nerif.geometry import Box, Camera
+from nerif.plotting.drawing import plain
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -54,7 +55,7 @@ def draw_rig(axes: Axes3D, cameras: Sequence[Camera], box: Box | None = None) ->
         outward = -corner.direction.mean(axis=0)  # the target may lie in the camera, if that is the world
         outward /= np.linalg.norm(outward)
         name_at = centre + (0.09, 0.2)[rank[i] % 2] * extent * outward  # so that names of neighbours do not overlap
-        axes.text(*name_at, camera.name, color=colour, fontsize=6.5, ha="center", va="center", parse_math=False)
+        axes.text(*name_at, plain(camera.name), color=colour, fontsize=6.5, ha="center", va="center")
         points += [name_at[None], corner.start, corner.end]
     if box is not None:
         vertices = np.array(list(itertools.product(*zip(box.lower, box.upper, strict=True))))

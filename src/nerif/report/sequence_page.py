@@ -13,6 +13,7 @@ from nerif.common.conventions import InputError, with_unit
 from nerif.data.volume import field_of
 from nerif.data.volume_sequence import ViewScores, VolumeSequence
 from nerif.forward.registry import technique, technique_of
+from nerif.plotting.drawing import plain
 from nerif.plotting.notebook import number
 from nerif.report.html import flat, render_page, svg
 from nerif.report.movie import finished_frames
@@ -121,7 +122,7 @@ def _curves(store: VolumeSequence, frames: list[int]) -> list[tuple[str, str]]:
         for i, name in enumerate(names):
             if np.isfinite(rms[:, i]).any():
                 style, label = ("--", f"{name} (withheld)") if name in withheld else ("-", name)
-                axes.plot(times, rms[:, i], lw=1.2, ls=style, label=label)
+                axes.plot(times, rms[:, i], lw=1.2, ls=style, label=plain(label))
         axes.set(xlabel="time [ms]", ylabel=f"rms difference from the measurement [{of.technique.unit}]")
         axes.set_ylim(bottom=0)
         axes.legend(fontsize=7, ncols=2)

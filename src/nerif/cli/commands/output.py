@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from nerif.cli.closed_output import is_closed_output, silence
+from nerif.common.conventions import printable
 from nerif.common.interruption import SIGNALS
 from nerif.reconstruction.base import OnStep, Step, compose
 from nerif.reconstruction.progress import Monitor
@@ -21,8 +22,8 @@ FIRST_LINE, LINE_INTERVAL = 2.0, 15.0  # s, of progress without a terminal
 
 
 def say(text: str) -> None:
-    """Print a line."""
-    print(text, flush=True)
+    """Print a line, of which control characters from files become escapes."""
+    print(printable(text), flush=True)
 
 
 def _say_safely(text: str) -> None:
@@ -63,6 +64,7 @@ def _interruptible() -> Iterator[Callable[[], bool]]:
 def counting_bar(title: str, total: int | None = None) -> Iterator[Callable[..., None]]:
     """Give a callback (done, total) that updates a progress bar, or lines of text without a terminal."""
     from rich.console import Console
+    from rich.markup import escape
     from rich.progress import MofNCompleteColumn, Progress
 
     console = Console(stderr=True)
@@ -72,7 +74,7 @@ def counting_bar(title: str, total: int | None = None) -> Iterator[Callable[...,
         return
     columns = (*Progress.get_default_columns(), MofNCompleteColumn())  # title, bar, percent, time left; m/n
     with Progress(*columns, console=console, transient=True) as bar:
-        task = bar.add_task(title, total=total)
+        task = bar.add_task(escape(title), total=total)
 
         def update(done: int, of: int | None = None) -> None:
             bar.update(task, completed=done, total=of or total)

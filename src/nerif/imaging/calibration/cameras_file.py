@@ -34,7 +34,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerif.common.arrays import Matrix3
-from nerif.common.conventions import InputError
+from nerif.common.conventions import InputError, check_name
 from nerif.common.files import check_known, read_toml, write_toml
 from nerif.geometry import PERSPECTIVE, Box, Camera, Lens, Plane, Projection, projection_named
 from nerif.geometry.distortion import UPRIGHT
@@ -231,8 +231,9 @@ def check_distortion(keys: Iterable[str], read: Collection[str], names: Sequence
 
 
 def check_names(cameras: Sequence[CalibratedCamera], where: str) -> None:
-    """Refuse two cameras of one name."""
+    """Refuse two cameras of one name, and names with control characters."""
     for name, count in Counter(camera.name for camera in cameras).items():
+        check_name(name, f"{where}: camera")
         if count > 1:
             raise InputError(f"expected cameras of different names, got {count} named '{name}'; rename", field=where)
 

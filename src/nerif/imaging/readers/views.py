@@ -33,7 +33,7 @@ from typing import overload
 import numpy as np
 from jaxtyping import Bool
 
-from nerif.common.conventions import InputError
+from nerif.common.conventions import InputError, check_name
 from nerif.common.files import check_known, ending, local_path, read_toml, write_toml
 from nerif.common.image_names import SOURCES, SUFFIXES
 from nerif.data.kinds import EXPERIMENT, reading_as
@@ -82,6 +82,9 @@ class View:
     mosaic: str = ""
     frame_offset: int = 0
     _opened: dict[str, Frames] = field(default_factory=dict, init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        check_name(self.name, f"{self.folder}: view")
 
     def __reduce__(self) -> tuple[type[View], tuple[object, ...]]:
         """State for another process, which opens the files itself."""
