@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import shutil
 import subprocess
 import sys
 import time
 from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from nicegui import Client, ui
 
-from app.serving import answering, end, free_port, outside
+from app.serving import answering, end, free_port, outside, served
 from nerif.app.elements import card
 from nerif.app.jobs import Jobs
+from nerif.app.pages import PAGES
 from nerif.app.private import secret
 from nerif.app.project import Project
+from nerif.app.server import _handler
 from nerif.app.sliders import RangeSlider
 from nerif.app.workspace import Workspace
 from nerif.common.conventions import InputError
@@ -196,3 +201,26 @@ def test_python_m_nerif_imports_no_package_of_a_folder(tmp_path):
     done = run(["-m", "nerif", "info", "m.nc"], tmp_path)
     assert (done.returncode, "m.nc" in done.stderr) == (2, True), done.stderr
     assert not (tmp_path / "mark").exists()
+
+
+@pytest.mark.parametrize("wrong", [5, [1], {"a": 1}], ids=str)
+def test_pages_open_with_the_defaults_where_drafts_have_wrong_types(tmp_path, wrong):
+    drafts = dict.fromkeys((page.name for page in PAGES), dict.fromkeys(("leave_out", "values", "target"), wrong))
+    (tmp_path / ".nerif").mkdir()
+    (tmp_path / ".nerif" / "drafts.json").write_text(json.dumps(drafts))
+    with served(tmp_path) as server:
+        cookie = {"Cookie": server.cookie()}
+        assert {page.name: server.get(page.path, cookie)[0] for page in PAGES} == dict.fromkeys(drafts, 200)
+
+
+def test_drafts_are_dropped_once(tmp_path, monkeypatch):
+    reloads = []
+    monkeypatch.setattr("nerif.app.server.ui.navigate.reload", lambda: reloads.append(1))
+    work = Workspace(Project(tmp_path))
+    work.keep("design", {"views": 4})
+    page = SimpleNamespace(build=lambda work: {}["no draft is the cause"])
+    monkeypatch.setattr("nerif.app.server.frame", lambda *arguments: nullcontext())
+    asyncio.run(_handler(work, page)())
+    assert (work.draft("design"), reloads) == ({}, [1])
+    with pytest.raises(KeyError):
+        asyncio.run(_handler(work, page)())

@@ -148,9 +148,14 @@ def _handler(work: Workspace, page: Page) -> Callable[[], Awaitable[None]]:
 
     async def build() -> None:
         with frame(work, page, PAGES):
-            coroutine = page.build(work)
-            if coroutine is not None:
-                await coroutine
+            try:
+                coroutine = page.build(work)
+                if coroutine is not None:
+                    await coroutine
+            except (TypeError, ValueError, AttributeError, LookupError):
+                if not work.forget_drafts():
+                    raise
+                ui.navigate.reload()  # with the defaults: drafts of a file may be anything
 
     return build
 

@@ -62,6 +62,11 @@ class Workspace:
             if error.errno not in NOT_WRITABLE:
                 raise
 
+    def forget_drafts(self) -> bool:
+        """Drop the drafts of all pages, and return whether there were any."""
+        drafts, self._drafts = self._drafts, {"forgotten": {}}
+        return any(drafts.values())
+
     async def contents(self) -> Contents:
         """Return the files of the project as they are now."""
         return await self.in_thread(self.project.contents)

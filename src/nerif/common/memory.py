@@ -58,6 +58,6 @@ def free_memory() -> int:
 
 
 def is_out_of_memory(error: BaseException) -> bool:
-    """Return whether memory was lacking, in whatever way a library says so."""
+    """Return whether an error, of any library, is a lack of memory."""
     message = str(error).lower()
     return isinstance(error, MemoryError) or any(text in message for text in OUT_OF_MEMORY)

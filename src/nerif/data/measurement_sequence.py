@@ -286,7 +286,7 @@ def _check_arrays(path: Path) -> None:
         with reading(f"{path}: not a readable Zarr store: {metadata.parent.name}"):
             array = zarr.open(metadata.parent, mode="r")
         if getattr(array, "ndim", 0) == 1:  # coordinates, which xarray reads at once
-            check_memory(array.nbytes, path, f"{path}: {metadata.parent.name}")
+            check_memory(getattr(array, "nbytes", 0), path, f"{path}: {metadata.parent.name}")
 
 
 def _opened(path: Path) -> xr.Dataset:
