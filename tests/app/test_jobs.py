@@ -70,7 +70,7 @@ def sleeping(jobs: Jobs, process: subprocess.Popen[bytes], **more: object) -> st
     """A run whose process is one that only sleeps."""
     job = jobs.add(("reconstruct", "m.nc", "--out", "r", "--live"), "run", "r")
     where = jobs.directory / job.id
-    began = psutil.Process(process.pid).create_time()
+    began = runner.began(process.pid)
     write_json(where / "started.json", {"pid": process.pid, "began": began, "time": time.time(), **more})
     return job.id
 
@@ -100,8 +100,21 @@ def test_another_server_finds_what_runs_and_may_end_it(tmp_path, process):
 
 def test_a_number_of_a_process_that_was_given_again_is_no_run(tmp_path, process):
     jobs = Jobs(tmp_path)
-    id = sleeping(jobs, process, began=1.0)
+    id = sleeping(jobs, process, began="1.0")
     assert jobs.get(id).state == "failed"
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere the system keeps the time of day at the start")
+def test_a_clock_that_is_set_starts_nothing_twice(tmp_path, process, monkeypatch):
+    jobs = Jobs(tmp_path)
+    running, claimed = sleeping(jobs, process), jobs.add(HELP, "x").id
+    assert claim(jobs.directory / claimed, process.pid)
+    boot = psutil.boot_time()
+    monkeypatch.setattr("psutil._pslinux.boot_time", lambda: boot + 3600)  # as by a clock that is an hour ahead
+    assert [jobs.get(id).state for id in (running, claimed)] == ["running", "running"]
+    jobs.at_once = 3
+    jobs.advance()
+    assert not (jobs.directory / claimed / "log.txt").exists()
 
 
 def test_what_is_paused_goes_on_from_its_checkpoint(tmp_path, process):

@@ -8,6 +8,7 @@ from contextlib import chdir
 import pytest
 
 from nerif.app.project import Project
+from nerif.app.workspace import Workspace
 from nerif.cli.cli import main
 from refusals import refused
 
@@ -86,6 +87,30 @@ def test_what_cannot_be_read_is_named(folder):
         pytest.skip("root may read everything")
     (folder / "closed").mkdir(mode=0)
     assert Project(folder).contents().unread[0][0] == "closed"
+
+
+def test_what_is_kept_of_files_is_bounded(folder, monkeypatch):
+    monkeypatch.setattr("nerif.app.project.LIMIT", 3)
+    project = Project(folder)
+    for i in range(5):
+        (folder / str(i)).touch()
+        for what in ("measurement", "kind"):
+            project.from_cache(str(i), what, lambda path: path.name)
+    assert {what: [path.name for path in cache] for what, cache in project._cache.items()} == {
+        "measurement": ["3", "4"],
+        "kind": ["2", "3", "4"],
+    }
+
+
+def test_two_servers_keep_the_drafts_of_each_other(folder):
+    first, second = Workspace(Project(folder)), Workspace(Project(folder))
+    for work in (first, second):
+        assert work.draft("design") == {}
+    first.keep("design", {"views": 5})
+    second.keep("check", {"view": "a"})
+    third = Workspace(Project(folder))
+    assert (third.draft("design"), third.draft("check")) == ({"views": 5}, {"view": "a"})
+    assert [path.name for path in (folder / ".nerif").iterdir()] == ["drafts.json"]
 
 
 def test_what_is_kept_of_a_file_is_as_new_as_the_file(folder):

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from pathlib import Path
 
 import pytest
 
+from nerif.common import files
 from nerif.common.files import atomic, check_known, local_path, read_toml, write_toml
 from refusals import refused
 
@@ -31,10 +33,9 @@ def test_a_file_takes_its_name_at_the_end_and_keeps_its_suffix(tmp_path):
 
 
 def test_a_directory_is_replaced_by_a_directory_only(tmp_path):
-    path, rest = tmp_path / "s.zarr", tmp_path / ".s.part.zarr"  # the rest of a killed process
-    for folder in (path, rest):
-        folder.mkdir()
-        (folder / "old").write_text("1")
+    path = tmp_path / "s.zarr"
+    path.mkdir()
+    (path / "old").write_text("1")
     with atomic(path) as part:
         assert not part.exists()
         part.mkdir()
@@ -44,6 +45,39 @@ def test_a_directory_is_replaced_by_a_directory_only(tmp_path):
         part.write_text("a file")
     assert names(path) == ["new"]
     assert names(tmp_path) == ["s.zarr"]
+
+
+def test_two_writers_of_one_file_keep_apart(tmp_path):
+    path = tmp_path / "a.nc"
+    with atomic(path) as first:
+        first.write_text("first")
+        with atomic(path) as second:
+            second.write_text("second")
+        assert path.read_text() == "second"
+    assert path.read_text() == "first"
+    assert names(tmp_path) == ["a.nc"]
+
+
+@pytest.mark.parametrize(("pid", "remains"), [(99_999_999, False), (os.getpid(), True)])
+def test_the_rest_of_a_killed_process_is_removed(tmp_path, pid, remains):
+    with atomic(tmp_path / "b.zarr") as part:
+        part.mkdir()
+        rest = tmp_path / part.name.replace(f"-{os.getpid()}-", f"-{pid}-").replace("b.", "s.")
+    rest.mkdir()
+    (rest / "old").touch()
+    foreign = tmp_path / ".s.00000000-99999999-0.part.zarr"  # of another machine
+    foreign.mkdir()
+    files._remove_rests.cache_clear()  # as in another process
+    with atomic(tmp_path / "a.nc") as part:
+        part.touch()
+    assert (rest.exists(), foreign.exists()) == (remains, True)
+
+
+def test_the_error_of_a_full_disk_names_the_file(tmp_path):
+    with pytest.raises(OSError) as error, atomic(tmp_path / "a.nc") as part:
+        raise OSError(errno.ENOSPC, "cannot write to a part\nat 12:00", str(part))
+    assert error.value.filename == str(tmp_path / "a.nc")
+    assert error.value.strerror == os.strerror(errno.ENOSPC)
 
 
 def test_toml_is_read_as_written_below_a_comment(tmp_path):

@@ -1,7 +1,9 @@
-"""Ctrl-C reports what is saved and how to continue; long work reports its progress, also without a terminal."""
+"""Ctrl-C and SIGTERM: what is saved and how to continue; long work reports its progress, also without a terminal."""
 
 from __future__ import annotations
 
+import errno
+import os
 import subprocess
 import sys
 import time
@@ -16,6 +18,7 @@ from nerif.cli.commands.output import MONITOR, counting_bar
 from nerif.common.files import atomic, written
 from nerif.common.interruption import Interrupted, if_interrupted
 from nerif.reconstruction.base import Step
+from nerif.reconstruction.files import CHECKPOINT, FIELD
 from nerif.reconstruction.progress import Monitor
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.results.directory import ResultDirectory
@@ -35,6 +38,9 @@ def test_the_innermost_message_takes_precedence():
         raise KeyboardInterrupt
     with pytest.raises(ValueError, match="other"), if_interrupted(lambda: "outer"):
         raise ValueError("other")
+    with pytest.raises(OSError) as full, if_interrupted(lambda: "outer"), if_interrupted(lambda: "inner"):
+        raise OSError(errno.ENOSPC, "no space", "a.nc")
+    assert str(full.value) == f"[Errno {errno.ENOSPC}] {os.strerror(errno.ENOSPC)}; inner: 'a.nc'"
 
 
 @pytest.mark.parametrize("verb", [verb for verb in COMMANDS if verb != "app"])
@@ -60,7 +66,7 @@ def test_complete_files_are_named(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(info, "main", half_done)
     assert main(["info"]) == 130
     message = capsys.readouterr().err
-    assert f"{tmp_path / 'f'} and 2 more; run the same command with --force" in message
+    assert f"{tmp_path / 'f'} and others; run the same command with --force" in message
     assert "lost" not in message
 
 
@@ -138,17 +144,39 @@ def test_a_note_of_a_step_is_one_line(capsys):
     assert capsys.readouterr().out == "the loss is of images from here on\n"
 
 
-def test_a_signal_ends_a_command_without_a_traceback(tmp_path):
-    code = (
+@pytest.mark.parametrize(("name", "code"), [("SIGINT", 130), ("SIGTERM", 143)])
+def test_a_signal_ends_a_command_without_a_traceback(name, code):
+    script = (
         "import signal, sys, nerif.cli.commands.info as info, nerif.cli.cli\n"
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # ignored in background jobs
-        "info.main = lambda words: signal.raise_signal(signal.SIGINT)\n"
-        "sys.exit(nerif.cli.cli.main(['info', '.']))\n"
+        f"info.main = lambda words: signal.raise_signal(signal.{name})\n"
+        "sys.argv[1:] = ['info', '.']\n"
+        "sys.exit(nerif.cli.cli.main())\n"
     )
-    process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
-    assert process.returncode == 130
+    process = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120)
+    assert process.returncode == code
     assert process.stderr.startswith("nerif: interrupted; ")
     assert process.stderr.count("\n") == 1
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="ends processes by POSIX signals")
+def test_a_run_that_gets_sigterm_ends_with_a_checkpoint_to_resume_from(measurement, tmp_path):
+    out, run = tmp_path / "r", [sys.executable, "-m", "nerif", "reconstruct"]
+    measurement.write(tmp_path / "m.nc")
+    words = ["--max-steps", "100000", "--network.depth", "2", "--network.width", "16", "--points-per-batch", "64"]
+    words += ["--withhold", "none", "--voxels", "8", "--device", "cpu", "--live", "--no-report"]
+    line = [*run, str(tmp_path / "m.nc"), "-o", str(out), *words]
+    with subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
+        while not (out / "live.json").exists():
+            assert process.poll() is None, process.communicate()[0]
+            time.sleep(0.02)
+        process.terminate()
+        text, _ = process.communicate(timeout=60)
+    assert process.returncode == 143, text
+    assert "stopping after this step" in text
+    assert {CHECKPOINT, FIELD, "metrics.json"} <= {path.name for path in out.iterdir()}
+    assert not list(out.glob(".*"))
+    assert ResultDirectory(out).state().scalars
 
 
 def test_a_simulated_sequence_reports_how_to_continue(tmp_path, monkeypatch):

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -11,7 +14,8 @@ import pytest
 from nerif.cli.cli import main
 from nerif.cli.commands import demo, reconstruct, simulate
 from nerif.common.conventions import InputError
-from nerif.common.written_files import WRITTEN, OwnFiles
+from nerif.common.files import atomic
+from nerif.common.written_files import ABOUT, WRITTEN, OwnFiles
 from nerif.data.measurement_sequence import MEASUREMENTS, MeasurementSequence, check_store
 from nerif.data.volume_sequence import FIELDS
 from nerif.fields.phantoms import make_phantom
@@ -121,19 +125,57 @@ def test_a_forged_list_reaches_nothing_outside_the_directory(tmp_path, name):
     precious = [put(tmp_path / "precious.txt"), put(tmp_path / "r" / "sub" / "precious.txt")]
     about = precious[0].stat()
     entry = {"bytes": about.st_size, "changed_ns": about.st_mtime_ns, "sha256": "0"}
-    put(tmp_path / "r" / WRITTEN, json.dumps({"files": {name: entry}}))
+    put(tmp_path / "r" / WRITTEN, json.dumps({"about": ABOUT, "files": {name: entry}}))
     OwnFiles(tmp_path / "r").remove()
     assert all(path.read_text() == "mine" for path in precious)
 
 
-@pytest.mark.parametrize("text", ["", "[]", '{"files": 3}', '{"files": {"a.nc": 3}}', '{"files": {"a.nc": {}}}'])
+@pytest.mark.parametrize("text", ["", "[]", "3", '{"a.nc": 3}', '{"a.nc": {}}'])
 def test_a_damaged_list_removes_nothing(tmp_path, text):
-    put(tmp_path / WRITTEN, text)
+    put(tmp_path / WRITTEN, f'{{"about": "{ABOUT}", "files": {text}}}' if text else text)
     put(tmp_path / "a.nc")
     files = OwnFiles(tmp_path, lambda line: None)
     files.remove(["a.nc"])
     assert (tmp_path / "a.nc").is_file()
     assert "a.nc" not in files
+
+
+@pytest.mark.parametrize("before", ["", "old"])
+def test_after_a_failed_write_a_later_file_of_that_name_is_foreign(tmp_path, lines, before):
+    files = OwnFiles(tmp_path, lines.append)
+    if before:
+        with files.writing("a.nc") as path:
+            path.write_text(before)
+    with pytest.raises(OSError), files.writing("a.nc") as path, atomic(path) as part:  # noqa: PT012
+        part.write_text("half")
+        raise OSError(errno.ENOSPC, "full")
+    assert ("a.nc" in files) == bool(before)
+    put(tmp_path / "a.nc", "measured since")
+    assert "a.nc" not in files
+    files.remove()
+    assert (tmp_path / "a.nc").read_text() == "measured since"
+
+
+def test_a_users_own_list_is_renamed(tmp_path, lines):
+    put(tmp_path / WRITTEN, '{"files": {"a.nc": {"pending": true}}}')
+    put(tmp_path / "a.nc")
+    files = OwnFiles(tmp_path, lines.append)
+    files.remove()
+    assert (tmp_path / "a.nc").is_file()
+    with files.writing("b.nc") as path:
+        path.touch()
+    assert "a.nc" in (tmp_path / "written.before.json").read_text()
+    assert "b.nc" in files
+    assert len(lines) == 1
+
+
+def test_two_processes_that_write_at_once_keep_both_entries(tmp_path):
+    code = "import sys; from nerif.common.written_files import OwnFiles\n"
+    code += "for i in range(40):\n    with OwnFiles(sys.argv[1]).writing(f'{sys.argv[2]}{i}') as p: p.touch()"
+    line = [sys.executable, "-c", code, str(tmp_path)]
+    processes = [subprocess.Popen([*line, name]) for name in "ab"]
+    assert [process.wait(60) for process in processes] == [0, 0]
+    assert all(f"{name}{i}" in OwnFiles(tmp_path) for name in "ab" for i in range(40))
 
 
 def test_a_link_is_foreign(tmp_path):

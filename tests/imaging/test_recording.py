@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
+import os
 import pickle
 from collections import Counter
 from dataclasses import replace
@@ -227,6 +228,15 @@ def test_processes_start_without_a_fork_server(monkeypatch):
     assert workers.start_method() in multiprocessing.get_all_start_methods()
     monkeypatch.setattr(workers, "get_all_start_methods", lambda: ["spawn"])  # as on Windows
     assert workers.start_method() == "spawn"
+
+
+def end_process(common, task):
+    os._exit(9)
+
+
+def test_a_killed_process_is_refused():
+    with refused("processes"):
+        list(workers.work(end_process, None, [1, 2], 2))
 
 
 @pytest.mark.slow

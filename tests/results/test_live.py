@@ -67,6 +67,21 @@ def test_the_view_is_seen_by_the_camera_that_is_refined(measurement, tmp_path, m
     np.testing.assert_allclose(*looks, atol=1e-4 * np.nanmax(np.abs(looks[0])))
 
 
+def test_a_status_that_cannot_be_written_does_not_end_a_run(measurement, tmp_path, monkeypatch, caplog):
+    def full(*_):
+        raise OSError(28, "no space")
+
+    monkeypatch.setattr(live, "FIELD_DELAY", 0.0)
+    monkeypatch.setattr(live, "write_json", full)
+    monkeypatch.setattr(live.np, "savez", full)
+    run = Run(report=False, withhold=("none",))
+    assert not reconstruct_into(tmp_path, measurement, METHODS[1], run, live=True, force=True).outcome.failed
+    assert [record.message for record in caplog.records] == [
+        "live view: not written (OSError: [Errno 28] no space); the run goes on"
+    ]
+    assert read_live(tmp_path) == {}
+
+
 def test_no_status_unless_requested(measurement, tmp_path):
     reconstruct_into(tmp_path, measurement, Tikhonov(voxels=8), Run(report=False, withhold=("none",)), force=True)
     assert read_live(tmp_path) == {}

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import errno
+import os
+import subprocess
+import sys
 from contextlib import nullcontext
 from dataclasses import replace
 
@@ -11,6 +15,7 @@ import torch
 
 from nerif.analysis.prediction import predict, reproject
 from nerif.cli.cli import main
+from nerif.common.files import atomic
 from nerif.common.written_files import WRITTEN
 from nerif.data.measurement import Measurement
 from nerif.reconstruction.base import Reconstruction
@@ -79,6 +84,44 @@ def test_field_and_volumes_are_written_before_the_reprojection(measurement, tmp_
     assert all(out.has(name) for name in ("field.safetensors", "volume.nc", "volume.vti", "history.csv"))
     assert out.metrics().outcome
     assert not out.metrics().views
+
+
+def test_a_second_run_into_the_directory_is_refused_and_leaves_the_first_alone(measurement, tmp_path):
+    measurement.write(tmp_path / "m.nc")
+    out, answers = tmp_path / "r", []
+
+    def begin_another(step):
+        if step.step == 2:
+            line = [sys.executable, "-m", "nerif", "reconstruct", str(tmp_path / "m.nc"), "--out", str(out), "--force"]
+            answers.append(subprocess.run([*line, "--seed", "7"], capture_output=True, text=True, timeout=100))
+
+    reconstruct_into(out, measurement, QUICK, RUN, on_step=begin_another, force=True)
+    assert answers[0].returncode == 2
+    assert f"another run writes to it (process {os.getpid()} on " in answers[0].stderr
+    result = ResultDirectory(out).read()
+    assert not result.missing
+    assert result.settings["method"] == "tikhonov"
+    assert not list(out.glob(".*"))
+
+
+def test_a_report_that_fails_does_not_end_a_run(measurement, tmp_path, monkeypatch):
+    lines, monitor = [], replace(Monitor(), say=lambda line: lines.append(line))
+    monkeypatch.setattr("nerif.report.html.render", lambda result: 1 / 0)
+    reconstruct_into(tmp_path / "r", measurement, QUICK, replace(RUN, report=True), monitor=monitor)
+    assert any(line.startswith("report: not written (ZeroDivisionError") for line in lines)
+    assert not ResultDirectory(tmp_path / "r").has(REPORT)
+
+
+def test_a_full_disk_names_the_file_and_how_to_continue(measurement, tmp_path, monkeypatch):
+    def full(self, reprojection):
+        with atomic(self / "reprojection.nc") as part:
+            raise OSError(errno.ENOSPC, "no space", str(part))
+
+    monkeypatch.setattr(ResultDirectory, "write_reprojection", full)
+    with pytest.raises(OSError) as error:
+        reconstruct_into(tmp_path / "r", measurement, QUICK, RUN)
+    assert error.value.filename == str(tmp_path / "r" / "reprojection.nc")
+    assert f"nerif reconstruct --resume --out {tmp_path / 'r'}" in error.value.strerror
 
 
 def test_corners_beyond_the_distortion_are_left_out_and_reported(measurement, tmp_path):

@@ -2,8 +2,8 @@
 
 Each run has a folder in FOLDER/.nerif/jobs with job.json (the request), log.txt, and started.json and ended.json of its
 process (runner.py); there is no other state. The name of an empty file is the owner of the run: `waiting`, and once a
-server has started a process for it, runner-PID-TIME of that process. A server claims a run by renaming this file, which
-only one server can do. If the process disappears before the run starts, the run is queued again.
+server has started a process for it, runner-PID-START of that process. A server claims a run by renaming this file,
+which only one server can do. If the process disappears before the run starts, the run is queued again.
 
 A folder may come from another user and contain runs. job.json is signed with a secret of the user (private.py); a run
 without signature, with changes, or signed for another folder, is refused: listed, but never started.
@@ -33,7 +33,7 @@ from typing import Any
 
 from nerif.app.private import secret
 from nerif.app.project import OWN
-from nerif.app.runner import ENDED, JOB, LOG, STARTED
+from nerif.app.runner import ENDED, JOB, LOG, STARTED, began
 from nerif.common.conventions import InputError
 from nerif.common.files import read_json, write_json
 from nerif.common.installation import command_line
@@ -43,7 +43,6 @@ from nerif.results.directory import RUN
 __all__ = ["REFUSED", "Job", "Jobs"]
 
 WAITING, OWNER = "waiting", "runner-"
-CLOCK = 1.5  # tolerance of the start time of a process, s
 LIMIT = 64  # simultaneous runs
 RESUMABLE = ("reconstruct", "sequence")
 OVER = ("done", "failed", "stopped", "refused")
@@ -174,7 +173,7 @@ class Jobs:
             return replace(job, state=over if job.request or not job.code else "failed")
         if started:
             job = replace(job, started=started["time"], pid=int(started["pid"]))
-            if alive or _alive(job.pid, started["began"]):
+            if alive or began(job.pid) == str(started["began"]):
                 return replace(job, state="running")
             return replace(job, state="stopped" if job.request else "failed", ended=(where / STARTED).stat().st_mtime)
         if job.request:
@@ -335,19 +334,17 @@ def _owner(where: Path) -> Path:
 def _owner_alive(owner: Path) -> bool:
     """Return whether the process that owns a run is alive."""
     _, _, process = owner.name.partition(OWNER)
-    pid, _, began = process.partition("-")
-    return bool(began) and _alive(int(pid), float(began))
+    pid, _, start = process.partition("-")
+    return bool(start) and began(int(pid)) == start
 
 
 def claim(where: Path, pid: int) -> bool:
     """Make a process the owner of a run; False if another process owns it or the run is removed."""
-    import psutil
-
     owner = _owner(where)
     if _owner_alive(owner):
         return False
     try:
-        owner.rename(where / f"{OWNER}{pid}-{psutil.Process(pid).create_time():.2f}")
+        owner.rename(where / f"{OWNER}{pid}-{began(pid)}")
     except FileNotFoundError:  # another server was faster
         return False
     return True
@@ -361,14 +358,3 @@ def _json(path: Path) -> dict[str, Any]:
     except (OSError, ValueError, RecursionError):
         return {}
     return content if isinstance(content, dict) else {}
-
-
-def _alive(pid: int, began: float) -> bool:
-    """Return whether the process with this start time is alive; a pid alone may be reused."""
-    import psutil
-
-    try:
-        process = psutil.Process(pid)
-        return abs(process.create_time() - began) < CLOCK and process.status() != psutil.STATUS_ZOMBIE
-    except psutil.NoSuchProcess:
-        return False

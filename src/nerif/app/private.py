@@ -5,12 +5,13 @@ from __future__ import annotations
 import os
 import secrets
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from html import escape
 from pathlib import Path
 from urllib.parse import urlsplit
 
 from nerif.common.conventions import InputError
+from nerif.common.locks import locked
 
 __all__ = ["page_leading_to", "secret"]
 
@@ -51,9 +52,8 @@ def secret() -> bytes:
     if not path.exists():
         part = path.with_name(f".{secrets.token_hex(8)}")
         _write(part, secrets.token_bytes(LENGTH))
-        with suppress(FileExistsError):  # two servers started at once share the key of the first
-            os.link(part, path)
-        part.unlink()
+        with locked(path, wait=True):  # two servers started at once share the key of the first
+            part.unlink() if path.exists() else part.rename(path)
     with path.open("rb") as file:
         about, content = os.fstat(file.fileno()), file.read()
     is_private = os.name != "posix" or (about.st_uid == os.geteuid() and not about.st_mode & 0o077)

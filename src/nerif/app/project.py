@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
+from collections import OrderedDict
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from threading import Lock
 from typing import TypeVar
 
 from nerif.common.conventions import InputError
@@ -21,6 +23,7 @@ __all__ = ["OWN", "Contents", "Project"]
 DEPTH = 3  # levels of folders that are searched
 LIMIT = 20_000  # entries that are searched
 OWN = ".nerif"
+CACHED = {"measurement": 2}  # whole files; of other entries, which are a few lines each, LIMIT
 
 T = TypeVar("T")
 
@@ -59,7 +62,8 @@ class Project:
         if not self.folder.is_dir():
             got = "a file" if self.folder.exists() else "none"
             raise InputError(f"expected a folder to work in, got {got}", field=folder)
-        self._cache: dict[tuple[str, str], tuple[tuple[int, int], object]] = {}
+        self._cache: dict[str, OrderedDict[Path, tuple[tuple[int, int], object]]] = {}
+        self._lock = Lock()  # pages use the cache in threads
 
     @property
     def name(self) -> str:
@@ -104,13 +108,20 @@ class Project:
         return find_views(self.path(experiment))
 
     def from_cache(self, name: str, what: str, read: Callable[[Path], T]) -> T:
-        """Return `read` of a file, cached under `what` until the file changes."""
+        """Return `read` of a file, cached under `what` until the file changes, or many others have been used since."""
         path = self.path(name)
         status = path.stat()
-        stamp, key = (status.st_mtime_ns, status.st_size), (str(path), what)
-        entry = self._cache.get(key)
+        stamp, limit = (status.st_mtime_ns, status.st_size), CACHED.get(what, LIMIT)
+        with self._lock:
+            cache = self._cache.setdefault(what, OrderedDict())  # least recently used first
+            entry = cache.get(path)
         if entry is None or entry[0] != stamp:
-            entry = self._cache[key] = (stamp, read(path))
+            entry = (stamp, read(path))
+        with self._lock:
+            cache[path] = entry
+            cache.move_to_end(path)
+            while len(cache) > limit:
+                cache.popitem(last=False)
         return entry[1]  # type: ignore[return-value]
 
     def contents(self) -> Contents:

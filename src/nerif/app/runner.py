@@ -18,15 +18,13 @@ from pathlib import Path
 from nerif.common.files import write_json
 from nerif.common.interruption import OWN_GROUP, interrupt
 
-__all__ = ["ENDED", "JOB", "LOG", "STARTED", "main"]
+__all__ = ["ENDED", "JOB", "LOG", "STARTED", "began", "main"]
 
 JOB, STARTED, ENDED, LOG = "job.json", "started.json", "ended.json", "log.txt"
 
 
 def main(directory: Path, words: Sequence[str]) -> None:
     """Run nerif with these arguments and wait for its end."""
-    import psutil
-
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may have set it to be ignored
     arguments = [sys.executable, "-P", "-m", "nerif", *words]  # -P: import no module of the folder
     environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
@@ -35,13 +33,32 @@ def main(directory: Path, words: Sequence[str]) -> None:
             arguments, cwd=directory.parents[2], stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=environment,
             **OWN_GROUP,
         )  # fmt: skip
-        began = psutil.Process(process.pid).create_time()
-        write_json(directory / STARTED, {"pid": process.pid, "began": began, "time": time.time()})
+        write_json(directory / STARTED, {"pid": process.pid, "began": began(process.pid), "time": time.time()})
         job = json.loads((directory / JOB).read_text(encoding="utf-8"))
         if job["request"]:  # to stop, before this process could get a signal
             interrupt(process.pid)
         code = process.wait()
     write_json(directory / ENDED, {"code": code, "time": time.time()})
+
+
+def began(pid: int) -> str:
+    """Return the start of a process, different for a later one of the same number; empty if there is none.
+
+    On Linux that is the start of the system and the ticks since then: a time of day changes when the clock is set.
+    """
+    import psutil
+
+    try:
+        process = psutil.Process(pid)
+        if process.status() == psutil.STATUS_ZOMBIE:
+            return ""
+        if not psutil.LINUX:  # where the system keeps the time of day at the start
+            return f"{process.create_time():.2f}"
+        boot, stat = Path("/proc/sys/kernel/random/boot_id"), Path(f"/proc/{pid}/stat")
+        ticks = stat.read_bytes().rpartition(b")")[2].split()[19].decode()
+        return f"{boot.read_text()[:8] if boot.is_file() else ''}.{ticks}"
+    except (psutil.Error, OSError):
+        return ""
 
 
 if __name__ == "__main__":

@@ -14,6 +14,7 @@ from nerif.app.jobs import Jobs
 from nerif.app.project import OWN, Contents, Project
 from nerif.cli.commands.settings import COMMAND_LINE_ONLY
 from nerif.common.files import write_json
+from nerif.common.locks import locked
 
 __all__ = ["READ_ONLY", "Workspace"]
 
@@ -42,22 +43,28 @@ class Workspace:
 
         The file may come from another person: COMMAND_LINE_ONLY survive no restart.
         """
-        if not self._drafts and self._file.is_file():
-            try:
-                entries = json.loads(self._file.read_text(encoding="utf-8"), object_hook=_harmless)
-            except (ValueError, RecursionError):  # damaged: only drafts are lost
-                entries = {}
-            drafts = entries if isinstance(entries, dict) else {}
-            self._drafts = {name: values for name, values in drafts.items() if isinstance(values, dict)}
+        if not self._drafts:
+            self._drafts = self._stored()
         return self._drafts.setdefault(page, {})
+
+    def _stored(self) -> dict[str, dict[str, Any]]:
+        """Return the entries of all pages as on disk."""
+        if not self._file.is_file():
+            return {}
+        try:
+            entries = json.loads(self._file.read_text(encoding="utf-8"), object_hook=_harmless)
+        except (ValueError, RecursionError):  # damaged: only drafts are lost
+            entries = {}
+        drafts = entries if isinstance(entries, dict) else {}
+        return {name: values for name, values in drafts.items() if isinstance(values, dict)}
 
     def keep(self, page: str, values: dict[str, Any]) -> None:
         """Store the entries of a page; in a read-only folder, only until the server ends."""
         self.draft(page)
         self._drafts[page] = dict(values)
         try:
-            self._file.parent.mkdir(exist_ok=True)
-            write_json(self._file, self._drafts)
+            with locked(self._file, wait=True):  # another server may store other pages
+                write_json(self._file, {**self._drafts, **self._stored(), page: self._drafts[page]})
         except OSError as error:
             if error.errno not in NOT_WRITABLE:
                 raise

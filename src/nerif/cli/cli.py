@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import io
 import os
+import signal
 import sys
 from contextlib import chdir
 
@@ -43,15 +44,17 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the command line and return its exit code.
 
     0: success; 1: no field (reconstruct, sequence) or a fault in the data (check --strict); 2: bad input;
-    130: interrupted; 141: standard output closed.
+    130: interrupted; 141: standard output closed; 143: ended by SIGTERM, whatever was complete by then.
     """
+    from nerif.common.interruption import handle_signals, received
+
     try:
         for stream in (sys.stdout, sys.stderr):
             if isinstance(stream, io.TextIOWrapper) and stream.encoding.lower() not in ("utf-8", "utf8"):
                 stream.reconfigure(errors="replace")  # a console without Greek letters shows question marks
         if arguments is None:
             _obey_nothing_in_the_current_folder()
-            _let_ctrl_break_interrupt()
+            handle_signals()
             arguments = sys.argv[1:]
         code = _run(list(arguments))
         sys.stdout.flush()
@@ -62,7 +65,7 @@ def main(arguments: list[str] | None = None) -> int:
             raise
         silence()
         return 141
-    return code
+    return 143 if signal.SIGTERM in received else code
 
 
 def _obey_nothing_in_the_current_folder() -> None:
@@ -77,14 +80,6 @@ def _obey_nothing_in_the_current_folder() -> None:
     if os.path.lexists("matplotlibrc"):
         with chdir(os.path.dirname(os.path.abspath(__file__))):
             import matplotlib  # noqa: F401
-
-
-def _let_ctrl_break_interrupt() -> None:
-    """Treat Ctrl-Break of Windows, which ends a process by default, as Ctrl-C."""
-    import signal
-
-    if hasattr(signal, "SIGBREAK"):
-        signal.signal(signal.SIGBREAK, signal.default_int_handler)
 
 
 def _run(words: list[str]) -> int:
@@ -143,8 +138,8 @@ def _files_written() -> str:
 
     if not written:
         return "nothing was written; run the same command again"
-    files = ", ".join(dict.fromkeys(map(str, written[-MAX_FILES_LISTED:])))
-    more = f" and {len(written) - MAX_FILES_LISTED} more" if len(written) > MAX_FILES_LISTED else ""
+    names = list(dict.fromkeys(map(str, written)))
+    files, more = ", ".join(names[-MAX_FILES_LISTED:]), " and others" * (len(names) > MAX_FILES_LISTED)
     return f"complete files: {files}{more}; run the same command with --force to start again"
 
 

@@ -3,23 +3,29 @@
 from __future__ import annotations
 
 import difflib
+import errno
+import functools
+import itertools
 import json
 import math
 import os
+import platform
 import re
 import shutil
 import time
 import tomllib
+import zlib
+from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 from nerif.common.conventions import InputError
 
 __all__ = [
-    "WINDOWS", "atomic", "check_file", "check_known", "ending", "is_file_name", "is_near", "local_path", "read_json",
-    "read_toml", "read_yaml", "recorded", "write_json", "write_toml", "written",
+    "DISK_FULL", "WINDOWS", "atomic", "check_file", "check_known", "ending", "is_file_name", "is_near", "local_path",
+    "read_json", "read_toml", "read_yaml", "recorded", "write_json", "write_toml", "written",
 ]  # fmt: skip
 
 WINDOWS = os.name == "nt"
@@ -29,12 +35,18 @@ DRIVE = re.compile(r"[A-Za-z]:[\\/]|\\\\")
 """Beginning of an absolute path of Windows."""
 RESERVED = re.compile(r'[<>:"|?*]|[. ]$|^(con|prn|aux|nul|com\d|lpt\d)(\.|$)', re.IGNORECASE)
 """Signs and names of no file of Windows; cam:1.png is there a hidden stream of the file cam."""
+DISK_FULL = tuple(getattr(errno, name) for name in ("ENOSPC", "EDQUOT", "EFBIG") if hasattr(errno, name))
+"""Errors of a write for which there is no space: on the disk, in the quota, or within a limit of the system."""
 ATTEMPTS_AFTER = (0.05, 0.1, 0.2, 0.4, 0.8)  # s, to rename a file over one that is open
 MOST_VALUES = 1_000_000  # of a YAML file
 ESCAPES = "in double quotes a backslash begins an escape: write paths with /, or in single quotes"
 
-written: list[Path] = []
-"""Paths that this process has written, in order."""
+PART = re.compile(r"\..*\.([0-9a-f]{8})-(\d+)-\d+\.part(\.[^.]*)?")
+"""Names of temporary files: machine, process and number keep those of two runs apart."""
+
+written: deque[Path] = deque(maxlen=100)
+"""The last paths that this process has written, in order."""
+_parts = itertools.count()
 
 
 def ending(path: str | os.PathLike[str]) -> str:
@@ -89,20 +101,45 @@ def is_file_name(name: str) -> bool:
 def atomic(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield a temporary path beside `path` that takes its name at the end, and is removed after an error.
 
-    The temporary name is hidden and keeps the suffix, by which libraries choose a format. A file replaces a file; a
-    directory replaces either.
+    The temporary name is hidden, of this process only, and keeps the suffix, by which libraries choose a format. A file
+    replaces a file; a directory replaces either. The error of a full disk names the file.
     """
     path = Path(path)
-    part = path.with_name(f".{path.stem}.part{path.suffix}")
-    _remove(part)  # left by a process that was killed
+    _remove_rests(path.parent)
+    part = path.with_name(f".{path.stem[:40]}.{_machine()}-{os.getpid()}-{next(_parts)}.part{path.suffix}")
     try:
         yield part
         if part.is_dir():
             _remove(path)
         _replace(part, path)
         written.append(path)
+    except OSError as error:
+        if error.errno in DISK_FULL:
+            error.filename, error.strerror = str(path), os.strerror(error.errno)  # libraries name none, or the part
+        raise
     finally:
         _remove(part)
+
+
+@functools.cache
+def _machine() -> str:
+    return f"{zlib.crc32(platform.node().encode()):08x}"
+
+
+@functools.lru_cache(256)  # directories, each looked through once by a process
+def _remove_rests(directory: Path) -> None:
+    """Remove temporary files left by processes of this machine that were killed."""
+    with suppress(OSError):  # no such directory, or of another user
+        for entry in os.scandir(directory):
+            match = PART.fullmatch(entry.name)
+            if match and match[1] == _machine() and not _exists(int(match[2])):
+                _remove(Path(entry.path))
+
+
+def _exists(pid: int) -> bool:
+    import psutil
+
+    return bool(psutil.pid_exists(pid))
 
 
 def _replace(part: Path, path: Path) -> None:

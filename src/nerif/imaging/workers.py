@@ -6,8 +6,11 @@ import os
 import signal
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import get_all_start_methods, get_context
 from typing import Any, TypeVar
+
+from nerif.common.conventions import InputError
 
 __all__ = ["cores", "start_method", "work"]
 
@@ -36,6 +39,8 @@ def work(
     function : of a module, so that other processes can import it
     common : argument of all tasks, sent once to each process
     processes : 1 for this one only
+
+    Raises InputError if one of the processes is killed.
     """
     tasks = list(tasks)
     processes = min(processes, len(tasks))
@@ -51,6 +56,12 @@ def work(
             for future in as_completed(list(futures)):
                 yield futures.pop(future), future.result()
                 del future  # frees its result
+        except BrokenProcessPool:
+            raise InputError(
+                f"one of {processes} was killed, as the system does when memory runs out; end other programs, or, on "
+                "Linux, work in one process by taskset -c 0 nerif ...",
+                field="processes",
+            ) from None
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import hashlib
 import json
+import re
 import time
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict
@@ -298,10 +299,14 @@ def write_tensors(path: Path, tensors: dict[str, torch.Tensor], about: dict[str,
     from safetensors.torch import save_file
 
     with OwnFiles(path.parent).writing(path.name), atomic(path) as part:
+        part.touch()
+        mode = part.stat().st_mode  # as the user's umask has it; safetensors makes files that only the user can read
         try:
             save_file(tensors, part, metadata={"nerif": json.dumps(about)})
-        except SafetensorError as error:  # safetensors has no OSError for a full disc
-            raise OSError(errno.EIO, f"cannot be written ({error})", str(path)) from None
+        except SafetensorError as error:  # safetensors has no OSError for a full disk
+            code = re.search(r"os error (\d+)", str(error))
+            raise OSError(int(code[1]) if code else errno.EIO, f"cannot be written ({error})", str(path)) from None
+        part.chmod(mode)
 
 
 def read_tensors(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:

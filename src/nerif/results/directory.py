@@ -16,6 +16,7 @@ from nerif import __version__
 from nerif.common.conventions import InputError
 from nerif.common.files import atomic, is_near, read_toml, recorded, write_toml
 from nerif.common.installation import command_line, word_of
+from nerif.common.locks import LOCK, locked
 from nerif.common.written_files import WARN, WRITTEN, OwnFiles, remove_empty
 from nerif.data.exports import export
 from nerif.data.kinds import RESULT, RUN, check_kind
@@ -150,13 +151,19 @@ class ResultDirectory:
         """Raise an error for a file or, unless forced, a directory that is not empty."""
         if self.path.is_file():
             raise InputError("expected a directory for --out, got a file", field=self.path)
-        if self.path.is_dir() and any(self.path.iterdir()) and not force:
+        if self.path.is_dir() and any(entry.name != LOCK for entry in self.path.iterdir()) and not force:
             raise InputError(
                 "exists already; give another --out, --force to overwrite it, or --resume to continue the run",
                 field=self.path,
             )
 
     # -- writing -------------------------------------------------------------------------------------------------
+
+    def locked(self) -> AbstractContextManager[None]:
+        """Return a context in which no other run writes into the directory; InputError if one does."""
+        if self.path.is_file():
+            self.check_free()
+        return locked(self.path, inside=True)
 
     def begin(self, settings: Mapping[str, Any], resume: bool = False) -> None:
         """Make the directory, remove the files of an earlier run unless resumed, and write the settings."""
@@ -211,8 +218,9 @@ class ResultDirectory:
 
     def add_metrics(self, **sections: Any) -> None:
         """Replace sections of metrics.json, which is made if there is none."""
-        present = self.metrics() if self.has(METRICS) else Metrics()
-        self.write_metrics(replace(present, **sections))
+        with locked(self.path / METRICS, wait=True):  # nerif evaluate may do the same during a run
+            present = self.metrics() if self.has(METRICS) else Metrics()
+            self.write_metrics(replace(present, **sections))
 
     def write_volumes(self, volumes: list[Volume]) -> None:
         """Write volume.nc and volume.vti."""

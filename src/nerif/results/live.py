@@ -3,8 +3,8 @@
     live.json    title, step, seconds, progress and losses with their curves: once a second at most
     live.npz     the field on a coarse grid, and one view as measured and predicted: as often as FIELD_SHARE allows
 
-Both are written atomically. After a field is written, which takes about 0.05 s, so much time passes that writing takes
-at most FIELD_SHARE of the run.
+Both are written atomically; where that fails, as on a full disk, the run goes on without them. After a field is
+written, which takes about 0.05 s, so much time passes that writing takes at most FIELD_SHARE of the run.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import torch
 from nerif.common.files import atomic, read_json, write_json
 from nerif.common.netcdf import reading
 from nerif.common.npz import open_npz
-from nerif.common.written_files import OwnFiles
+from nerif.common.written_files import WARN, OwnFiles
 from nerif.data.measurement import Measurement, Observation
 from nerif.data.volume import Volume, describe
 from nerif.fields.base import Field
@@ -106,7 +106,7 @@ class Live:
         self.model = str(getattr(reconstructor, "model", AUTO))
         self.view = view or best_covered(measurement.cameras)[0]
         self._curve: list[dict[str, float]] = []
-        self._interval = 1
+        self._interval, self._failed = 1, False
 
     def watching(self, monitor: Monitor, withheld: bool, looks: bool = True) -> Monitor:
         """Return a monitor that also writes the status.
@@ -123,7 +123,7 @@ class Live:
                 newest: list[Step] = []
                 yield compose(self._writer(title, withheld, looks, newest), on_step)
             if newest:  # the last step
-                self._write(title, newest[0])
+                self._attempt(self._write, title, newest[0])
 
         return replace(monitor, training=training)
 
@@ -140,14 +140,22 @@ class Live:
             self._append(step)
             now = time.monotonic()
             if now - written >= STATUS_INTERVAL:
-                self._write(title, step)
+                self._attempt(self._write, title, step)
                 written = now
             if looks and now - start >= FIELD_DELAY and total + last <= FIELD_SHARE * (now - start):
-                self._look(title, step, withheld)
+                self._attempt(self._look, title, step, withheld)
                 last = time.monotonic() - now
                 total += last
 
         return on_step
+
+    def _attempt(self, write: Callable[..., None], *arguments: object) -> None:
+        try:
+            write(*arguments)
+        except Exception as error:  # nothing that is only shown ends a run
+            if not self._failed:
+                WARN(f"live view: not written ({type(error).__name__}: {error}); the run goes on")
+            self._failed = True
 
     def _append(self, step: Step) -> None:
         losses = {k: v for k, v in step.losses.items() if isinstance(v, float)}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from contextlib import nullcontext
 from typing import Any
 
 import torch
@@ -12,6 +13,7 @@ from nerif.common.interruption import if_interrupted
 from nerif.data.measurement import Measurement
 from nerif.reconstruction.base import OnStep, Reconstruction, Reconstructor
 from nerif.reconstruction.device import Cores
+from nerif.reconstruction.neural.parallel import Ranks
 from nerif.reconstruction.progress import QUIET, Monitor
 from nerif.results.directory import ResultDirectory
 from nerif.workflow.job import Job, Run, remedy
@@ -38,7 +40,7 @@ def reconstruct_into(
     """Reconstruct, and write the result directory of docs/formats.md.
 
     Field, history and volumes are written first, then the re-projection into the views and the report. An earlier
-    result is left as it is if any input is invalid.
+    result is left as it is if any input is invalid, or another run writes to the directory.
 
     Parameters
     ----------
@@ -56,8 +58,9 @@ def reconstruct_into(
     since : time from which the time limit counts, s since the epoch; None for now
     """
     out, jobs, run = ResultDirectory(directory, monitor.say), list[Job](), run or Run()
+    alone = out.locked() if Ranks.from_environment().is_first else nullcontext()  # the others do not write
     own_files = lambda: resume or any(job.begun for job in jobs)  # noqa: E731
-    with Cores(torch.device("cpu"), run.threads), if_interrupted(lambda: remedy(out, own_files())):
+    with Cores(torch.device("cpu"), run.threads), alone, if_interrupted(lambda: remedy(out, own_files())):
         job = Job(
             out, measurement, reconstructor, run, voxels=voxels, resume=resume, force=force, keep=keep,
             on_step=on_step, monitor=monitor, live=live, since=since,

@@ -407,7 +407,11 @@ class WriteReport(PipelineStep):
 
     @staticmethod
     def run(job: Job) -> None:
-        write_report(job.out.path, monitor=job.monitor)
+        try:
+            write_report(job.out.path, monitor=job.monitor)
+        except Exception as error:  # of a figure, or of a full disk: the result is complete without it
+            reason = f"{type(error).__name__}: {error}"
+            job.monitor.say(f"report: not written ({reason}); write it by nerif report {job.out.path}")
 
 
 STEPS: tuple[type[PipelineStep], ...] = (

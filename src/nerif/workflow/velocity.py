@@ -18,6 +18,7 @@ from torch import Tensor
 from nerif.common.conventions import InputError
 from nerif.common.files import atomic, ending
 from nerif.common.interruption import if_interrupted
+from nerif.common.locks import locked
 from nerif.data.measurement_sequence import MeasurementSequence, check_store
 from nerif.data.velocity_sequence import COMPONENTS, VelocitySequence
 from nerif.data.volume import INDEX
@@ -88,7 +89,6 @@ def velocity_of_film(
     displacements = None if improvement is None else improvement.inputs
     place = [store.grid.box.lower, store.grid.box.upper, store.n_ambient, symmetry]
     inputs = digest([theta, list(times), place, _without_limits(method), displacements])
-    state = _resumed(checkpoint, inputs, say)
     saved = time.monotonic()
 
     def update(iterate: Iterate, best: State) -> None:
@@ -105,10 +105,11 @@ def velocity_of_film(
             return "nothing was written; run the same command again"
         return f"the state is kept in {checkpoint}; run the same command again to continue"
 
-    with if_interrupted(stopped):
+    with locked(out), if_interrupted(stopped):
+        state = _resumed(checkpoint, inputs, say)
         flow = method(section.of(theta), section.grid, times, update, state, improvement, section.box)
-    result = _write(out, store, theta, times, settings, flow, section)
-    checkpoint.unlink(missing_ok=True)
+        result = _write(out, store, theta, times, settings, flow, section)
+        checkpoint.unlink(missing_ok=True)
     share = float(np.mean([np.isfinite(result.read("u", k)).mean() for k in range(len(times))]))
     say(
         f"{out}: {len(times)} instants, velocity known in {share:.0%} of the box, rms residual of transport "

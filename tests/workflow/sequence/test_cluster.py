@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import gc
 import importlib
 import os
@@ -18,6 +19,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import psutil
@@ -208,14 +210,19 @@ def test_workers_share_the_gpus_that_are_left_to_the_command(monkeypatch, visibl
 
 
 @pytest.mark.slow
-def test_ctrl_c_keeps_complete_frames_and_tells_how_to_continue(film, tmp_path):
-    out = tmp_path / "out.zarr"
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_an_interruption_keeps_complete_frames_and_tells_how_to_continue(film, tmp_path, number, code):
+    out, scratch = tmp_path / "out.zarr", tmp_path / "scratch"
+    scratch.mkdir()
     slowly = command(film, out, "--max-steps", "200", "--warm-steps", "100")
-    process = subprocess.Popen(slowly, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "env": {**os.environ, "TMPDIR": str(scratch)}}
+    process = subprocess.Popen(slowly, text=True, **pipes)
     wait(out, 2, process)
-    process.send_signal(signal.SIGINT)
+    process.send_signal(number)
     text, errors = process.communicate(timeout=60)
-    assert process.returncode == 130, errors
+    assert process.returncode == code, errors
+    assert not list(scratch.glob("nerif-*"))
+    assert [path.name for path in tmp_path.iterdir() if path.name.startswith(".")] == []
     assert "missing; run the same command again" in text
     assert "Traceback" not in errors
     assert (status_of(out) == DONE).sum() >= 2
@@ -296,6 +303,58 @@ def test_a_chunk_whose_work_raises_fails_with_the_reason_and_the_rest_goes_on(fi
     assert store.status.tolist() == [DONE, FAILED, FAILED, DONE, DONE]
     assert store.reasons[1] == "KeyError: 'layer 7'"
     assert (progress.done, progress.failed) == (3, 2)
+
+
+def test_workers_that_die_before_they_begin_end_the_run(five, tmp_path, monkeypatch):
+    from distributed import Client, KilledWorker
+
+    from nerif.workflow.sequence import run
+
+    def work(plan, first, last, event):
+        if first == 0:
+            raise KilledWorker("frames", SimpleNamespace(address=""), 0)
+        real(plan, first, last, event)
+
+    plan, real = _plan(five, tmp_path / "out.zarr", 3), run.reconstruct_frames
+    monkeypatch.setattr(run, "reconstruct_frames", work)
+    with Client(processes=False, n_workers=1, threads_per_worker=1, dashboard_address=None) as client:
+        progress = run.run_sequence(client, plan)
+    assert SequenceStore(plan.out).status.tolist() == [MISSING] * 3 + [DONE] * 2
+    assert (progress.done, progress.failed, progress.deaths) == (2, 0, run.MOST_UNBEGUN)
+    assert progress.loss.startswith("workers died 10 times; ")
+
+
+def test_a_run_without_workers_ends(five, tmp_path, monkeypatch):
+    from distributed import Client
+
+    from nerif.workflow.sequence import run
+
+    plan = _plan(five, tmp_path / "out.zarr", 3)
+    for name in ("LOOK_EVERY", "WITHOUT_WORKERS"):
+        monkeypatch.setattr(run, name, 0.1)
+    with Client(processes=False, n_workers=0, dashboard_address=None) as client:
+        progress = run.run_sequence(client, plan)
+    assert (SequenceStore(plan.out).status == MISSING).all()
+    assert "no worker is left" in progress.loss
+
+
+def test_a_full_disk_fails_no_frame(five, tmp_path, monkeypatch):
+    from distributed import Client
+
+    from nerif.workflow.sequence import run
+
+    def work(*_):
+        raise OSError(errno.ENOSPC, "no space")
+
+    plan = _plan(five, tmp_path / "out.zarr", 3)
+    monkeypatch.setattr(run, "reconstruct_frames", work)
+    with (
+        Client(processes=False, n_workers=1, threads_per_worker=1, dashboard_address=None) as client,
+        pytest.raises(OSError) as error,
+    ):
+        run.run_sequence(client, plan)
+    assert error.value.errno == errno.ENOSPC
+    assert (SequenceStore(plan.out).status == MISSING).all()
 
 
 def _plan(film: Path, out: Path, chunk: int):

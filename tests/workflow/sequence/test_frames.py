@@ -46,6 +46,19 @@ def undisturbed(five: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[S
     return plan, events
 
 
+def test_the_status_of_one_frame_is_read_for_it(undisturbed, monkeypatch):
+    plan, indices, read = undisturbed[0], [], SequenceStore.read
+
+    def record(self, name, index):
+        if name == "status":
+            indices.append(index)
+        return read(self, name, index)
+
+    monkeypatch.setattr(SequenceStore, "read", record)
+    reconstruct_frames(plan, 0, 5)
+    assert set(indices) == set(range(5))
+
+
 def test_frames_are_written_with_fields_and_scores(undisturbed, tmp_path):
     plan, events = undisturbed
     assert [e["what"] for e in events] == ["begun", "done"] * 5

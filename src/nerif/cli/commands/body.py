@@ -15,6 +15,7 @@ from nerif.cli.arguments import check_output
 from nerif.cli.commands.output import counting_bar, say
 from nerif.cli.commands.settings import Settings, command
 from nerif.common.conventions import InputError
+from nerif.common.locks import locked
 from nerif.data.body_file import read_body
 from nerif.data.measurement import Measurement
 from nerif.data.measurement_sequence import MeasurementSequence
@@ -82,7 +83,8 @@ def run(settings: BodyInFlow) -> Measurement:
         return measurement
     stated, bodies = settings.unit is not None, _bodies(settings, measurement)
     if film:
-        measurement = _film(settings, bodies, out)
+        with locked(out):
+            measurement = _film(settings, bodies, out)
     else:
         with counting_bar("pixels that see a body", len(measurement.names)) as bar:
             measurement = with_bodies(measurement, [*measurement.bodies, *bodies], settings.margin, stated, bar)

@@ -15,6 +15,7 @@ from nerif.cli.commands.output import counting_bar, say
 from nerif.cli.commands.settings import Flat, Settings, command
 from nerif.common.conventions import InputError
 from nerif.common.interruption import if_interrupted
+from nerif.common.locks import locked
 from nerif.common.settings import Count, NonNegative
 from nerif.data.measurement import Measurement
 from nerif.data.measurement_sequence import MeasurementSequence
@@ -125,8 +126,9 @@ def _run_over_time(settings: Displacement, recording: Recording) -> MeasurementS
     attributes = {k: v for k, v in asdict(settings).items() if k not in UNRECORDED}
     remedy = f"complete frames are kept in {settings.out}; run the same command again to continue"
     count = len(recording.views) + len(numbers)
-    with if_interrupted(lambda: remedy), counting_bar("references, then frames", count) as bar:
-        return measure_recording(recording, numbers, times, settings.out, attributes, settings.force, say, bar)
+    out = settings.out
+    with locked(out), if_interrupted(lambda: remedy), counting_bar("references, then frames", count) as bar:
+        return measure_recording(recording, numbers, times, out, attributes, settings.force, say, bar)
 
 
 def _print(measurement: Measurement, noise: Mapping[str, str]) -> None:

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 
 from nerif.cli.closed_output import is_closed_output, silence
 from nerif.common.conventions import printable
-from nerif.common.interruption import SIGNALS
+from nerif.common.interruption import SIGNALS, received
 from nerif.reconstruction.base import OnStep, Step, compose
 from nerif.reconstruction.progress import Monitor
 
@@ -42,6 +42,7 @@ def _interruptible() -> Iterator[Callable[[], bool]]:
     times: list[float] = []
 
     def handler(number: int, frame: object) -> None:
+        received.append(number)
         times.append(time.monotonic())
         if len(times) == 1:
             print("\nstopping after this step; Ctrl-C again to interrupt", file=sys.stderr, flush=True)

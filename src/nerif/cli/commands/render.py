@@ -53,13 +53,15 @@ class Render(Settings):
 
 def run(settings: Render) -> None:
     """Write images and true field."""
-    ResultDirectory(settings.out).check_free(settings.force)
+    directory = ResultDirectory(settings.out)
+    directory.check_free(settings.force)
     cameras, images = settings.ring.cameras(settings.f_number), settings.images
     box = Box.around_origin(settings.box)
     phantom = make_phantom(settings.phantom, box, settings.phantom_seed)
     count = itertools.count(1)
     remedy = f"{settings.out} lacks images; run the same command with --force to start again"
-    with if_interrupted(lambda: remedy), counting_bar("rendering", images.images(len(cameras))) as bar:
+    total = images.images(len(cameras))
+    with directory.locked(), if_interrupted(lambda: remedy), counting_bar("rendering", total) as bar:
         images.write(
             settings.out, cameras, phantom, box, settings.n_ambient, settings.truth_voxels,
             lambda: bar(next(count)),

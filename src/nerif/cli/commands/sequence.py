@@ -67,6 +67,7 @@ def run(settings: Sequence) -> SequenceStore:
         def update(progress: Progress) -> None:
             figures = f"{progress.settled}/{progress.total} | {progress.frames_per_minute:.1f} frames/min"
             figures += f" | {progress.failed} failed"
+            figures += f" | {progress.deaths} deaths of workers" * bool(progress.deaths)
             if progress.settled:
                 figures += f" | {progress.seconds_left:.0f} s left"
             bar(progress.settled / max(progress.total, 1), figures, progress.seconds)

@@ -13,6 +13,7 @@ from nerif.cli.commands.output import counting_bar, say
 from nerif.cli.commands.settings import Flat, Settings, command
 from nerif.common.conventions import InputError, with_unit
 from nerif.common.interruption import if_interrupted
+from nerif.common.locks import locked
 from nerif.data.volume_file import write_netcdf
 from nerif.geometry import Ring
 from nerif.simulation.simulate import Simulation
@@ -49,7 +50,7 @@ def run(settings: Simulate) -> None:
     cameras = settings.ring.cameras(settings.f_number)
     if times:
         remedy = f"{out} and {truth} lack frames; run the same command with --force to start again"
-        with if_interrupted(lambda: remedy), counting_bar("simulating frames") as bar:
+        with locked(out), if_interrupted(lambda: remedy), counting_bar("simulating frames") as bar:
             _, store = settings.simulation.over_time(times, cameras, out, truth, settings.force, bar)
         say(f"{out}: {len(times)} frames of {len(cameras)} views")
         grid = store.grid

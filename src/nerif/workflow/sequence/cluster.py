@@ -26,6 +26,7 @@ __all__ = ["check_workers", "open_cluster", "slurm_cluster"]
 
 DASK_SETTINGS = {
     "distributed.scheduler.allowed-failures": 0,  # run.py counts deaths by frame
+    "distributed.deploy.lost-worker-timeout": "120s",  # a process or job whose worker does not return by then is ended
     "distributed.scheduler.worker-saturation": 1.0,  # chunks queue at the scheduler, not at workers
     "distributed.comm.timeouts.connect": "60s",
     "distributed.worker.profile.enabled": False,  # an hour of stack samples is a gigabyte

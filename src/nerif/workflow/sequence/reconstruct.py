@@ -10,7 +10,8 @@ from pathlib import Path
 
 from nerif.common.conventions import InputError
 from nerif.common.files import ending
-from nerif.common.interruption import Interrupted
+from nerif.common.interruption import if_interrupted
+from nerif.common.locks import locked
 from nerif.data.measurement import Measurement
 from nerif.data.measurement_sequence import MeasurementSequence
 from nerif.geometry import Grid
@@ -44,7 +45,8 @@ def reconstruct_sequence(
     """Reconstruct every frame of a measurement sequence that a store lacks.
 
     Scripts must call it under `if __name__ == "__main__":`, since local workers are processes that import the script.
-    The store is left as it is if any input is invalid, or differs from that of an earlier run.
+    The store is left as it is if any input is invalid, or differs from that of an earlier run, or while another run
+    writes to it.
 
     Parameters
     ----------
@@ -83,25 +85,32 @@ def reconstruct_sequence(
     network = reconstructor.resolved_by(like).network
     reconstructor = replace(reconstructor, network=network, wave_pixels=0, source="displacements")
     plan = SequencePlan(measurement.resolve(), out.resolve(), reconstructor, settings, threads)
-    store = _store(plan, sequence, like, force, say)
-    if store.symmetry is not None:
-        plan = replace(plan, cold=with_axis(plan.cold, store.symmetry))
-    if retry:
-        say(f"{store.forget_failures()} failed frames are tried again")
-    if pending := int((store.status == MISSING).sum()):
-        say(f"{out}: {pending} of {len(sequence)} frames to reconstruct, in chunks of {settings.chunk}")
-        try:
-            with open_cluster(cluster, workers, out.parent.resolve(), dashboard) as (client, share):
+    with locked(plan.out):
+        store = _store(plan, sequence, like, force, say)
+        if store.symmetry is not None:
+            plan = replace(plan, cold=with_axis(plan.cold, store.symmetry))
+        if retry:
+            say(f"{store.forget_failures()} failed frames are tried again")
+        if pending := int((store.status == MISSING).sum()):
+            say(f"{out}: {pending} of {len(sequence)} frames to reconstruct, in chunks of {settings.chunk}")
+            with if_interrupted(lambda: _kept(store, say)), open_cluster(
+                cluster, workers, plan.out.parent, dashboard
+            ) as (client, share):
                 if dashboard and client.dashboard_link:
                     say(f"dashboard: {client.dashboard_link}")
                 say("waiting for workers")
                 check_workers(client)
-                run_sequence(client, replace(plan, threads=threads or share), on_progress)
-        except KeyboardInterrupt:
-            say(outcome_table(store))
-            raise Interrupted(f"complete frames are kept in {out}; run the same command again to continue") from None
+                progress = run_sequence(client, replace(plan, threads=threads or share), on_progress)
+            if progress.loss:
+                say(progress.loss)
     say(outcome_table(store))
     return store
+
+
+def _kept(store: SequenceStore, say: Callable[[str], None]) -> str:
+    """Print the outcome of an interrupted run, and return how to continue."""
+    say(outcome_table(store))
+    return f"complete frames are kept in {store.path}; run the same command again to continue"
 
 
 def _store(

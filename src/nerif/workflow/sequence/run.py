@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 from nerif.common.conventions import with_unit
+from nerif.common.files import DISK_FULL
 from nerif.reconstruction.device import keep_freed_memory
 from nerif.workflow.sequence.frames import ATTEMPTS, reconstruct_frames
 from nerif.workflow.sequence.plan import SequencePlan
@@ -23,6 +24,9 @@ if TYPE_CHECKING:
 
 __all__ = ["Progress", "chunks_of", "outcome_table", "run_sequence"]
 
+LOOK_EVERY, WITHOUT_WORKERS = 5.0, 60.0  # s, between looks for workers, and before a run without any ends
+MOST_UNBEGUN = 10  # deaths before a chunk has begun a frame; it may be that of another chunk of the same worker
+
 
 @dataclass
 class Progress:
@@ -32,12 +36,16 @@ class Progress:
     ----------
     total : frames to reconstruct in this run
     done, failed : numbers of them
+    deaths : of workers
+    workerless : whether it ended because no worker was left
     begin : monotonic clock, s
     """
 
     total: int
     done: int = 0
     failed: int = 0
+    deaths: int = 0
+    workerless: bool = False
     begin: float = field(default_factory=time.monotonic)
 
     @property
@@ -61,6 +69,14 @@ class Progress:
         rate = self.frames_per_minute / 60
         return (self.total - self.settled) / rate if rate else float("nan")
 
+    @property
+    def loss(self) -> str:
+        """A sentence about workers that died; empty if none did."""
+        if not self.deaths and not self.workerless:
+            return ""
+        end = "; ended, since no worker is left" if self.workerless else ""
+        return f"workers died {self.deaths} times{end}; out of memory? See the log of the workers"
+
 
 def chunks_of(missing: Sequence[int], length: int, frames: int) -> list[tuple[int, int]]:
     """Return first and last + 1 of the chunks of time with a missing frame.
@@ -73,13 +89,16 @@ def chunks_of(missing: Sequence[int], length: int, frames: int) -> list[tuple[in
 def run_sequence(
     client: Client, plan: SequencePlan, on_progress: Callable[[Progress], None] = lambda progress: None
 ) -> Progress:
-    """Reconstruct every missing frame of a store, also if workers die or chunks fail."""
-    from distributed import KilledWorker, as_completed
+    """Reconstruct every missing frame of a store, also if workers die or chunks fail.
+
+    Frames remain missing if no worker is left, or if the workers of their chunk die before they begin.
+    """
+    from distributed import KilledWorker, wait
 
     store, status = SequenceStore(plan.out), SequenceStore(plan.out).status
     missing = np.flatnonzero(status == MISSING).tolist()
     progress, topic = Progress(len(missing)), f"nerif-{uuid.uuid4()}"
-    starts, deaths = Counter[int](), Counter[int]()  # by frame
+    starts, deaths, unbegun = Counter[int](), Counter[int](), Counter[int]()  # by frame
     chunks: dict[str, tuple[int, int]] = {}  # by the key of their task
 
     def on_event(event: tuple[float, dict[str, Any]]) -> None:
@@ -105,26 +124,47 @@ def run_sequence(
     client.subscribe_topic(topic, on_event)
     on_progress(progress)
     try:
-        queue = as_completed([submit(*chunk) for chunk in chunks_of(missing, plan.settings.chunk, len(status))])
-        for future in queue:
-            first, last = chunks.pop(str(future.key))
-            if future.status != "error":
-                future.result()  # raises if the cluster was lost
+        pending, since = {submit(*chunk) for chunk in chunks_of(missing, plan.settings.chunk, len(status))}, None
+        while pending:
+            try:
+                ended, pending = wait(pending, timeout=LOOK_EVERY, return_when="FIRST_COMPLETED")
+            except TimeoutError:
+                since = None if has_workers(client) else since or time.monotonic()
+                if since is not None and time.monotonic() - since > WITHOUT_WORKERS:
+                    progress.workerless = True
+                    break
                 continue
-            rest, error = [i for i in range(first, last) if store.status[i] == MISSING], future.exception()
-            if not isinstance(error, KilledWorker):
-                fail(rest, f"{type(error).__name__}: {error}", 1)
-                continue
-            if rest and starts[rest[0]] > deaths[rest[0]]:
-                deaths[rest[0]] += 1
-                if deaths[rest[0]] >= ATTEMPTS:
-                    reason = f"its worker died {ATTEMPTS} times; out of memory? See the log of the worker"
-                    fail([rest.pop(0)], reason, ATTEMPTS)
-            if rest:
-                queue.add(submit(first, last))
+            for future in ended:
+                first, last = chunks.pop(str(future.key))
+                if future.status != "error":
+                    future.result()  # raises if the cluster was lost
+                    continue
+                error = future.exception()
+                rest = (first + np.flatnonzero(store.read("status", slice(first, last)) == MISSING)).tolist()
+                if isinstance(error, OSError) and error.errno in DISK_FULL:
+                    raise error
+                if not isinstance(error, KilledWorker):
+                    fail(rest, f"{type(error).__name__}: {error}", 1)
+                    continue
+                progress.deaths += 1
+                on_progress(progress)
+                if rest and starts[rest[0]] > deaths[rest[0]]:
+                    deaths[rest[0]] += 1
+                    if deaths[rest[0]] >= ATTEMPTS:
+                        reason = f"its worker died {ATTEMPTS} times; out of memory? See the log of the worker"
+                        fail([rest.pop(0)], reason, ATTEMPTS)
+                elif rest:
+                    unbegun[rest[0]] += 1
+                if rest and unbegun[rest[0]] < MOST_UNBEGUN:
+                    pending.add(submit(first, last))
     finally:
         client.unsubscribe_topic(topic)
     return progress
+
+
+def has_workers(client: Client) -> bool:
+    """Return whether a cluster has workers, or processes or jobs that may become some."""
+    return bool(client.scheduler_info()["workers"] or getattr(client.cluster, "workers", None))
 
 
 def _in_worker(plan: SequencePlan, first: int, last: int, topic: str) -> None:
