@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -81,6 +84,30 @@ def test_every_format_leaves_only_its_file(volumes, tmp_path):
     for ending in FORMATS:
         export(tmp_path / f"v{ending}", volumes)
     assert {p.name for p in tmp_path.iterdir()} == {f"v{ending}" for ending in FORMATS}
+
+
+FULL = """
+import errno, resource, sys, torch
+from nerif.data.exports import FORMATS, export
+from nerif.data.volume import Volume
+from nerif.geometry import Box, Grid
+volume = Volume(torch.rand(30, 31, 32), Grid(Box.cube(1.0), (30, 31, 32)), attributes={"n_ambient": 1.00027})
+resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
+for ending in FORMATS:
+    try:
+        export(sys.argv[1] + "/v" + ending, [volume])
+    except OSError as error:
+        print(ending, error.errno == errno.EFBIG, error.filename)
+"""
+
+
+@pytest.mark.skipif(os.name == "nt", reason="limits of POSIX")
+def test_no_format_crashes_where_there_is_no_space(tmp_path):
+    """As on a full disk, here by a limit of the size of files, in a process of its own: HDF5 ended it by a fault."""
+    process = subprocess.run([sys.executable, "-c", FULL, str(tmp_path)], capture_output=True, text=True, timeout=100)
+    assert process.returncode == 0, process.stderr
+    assert process.stdout.splitlines() == [f"{ending} True {tmp_path / f'v{ending}'}" for ending in FORMATS]
+    assert not list(tmp_path.iterdir())
 
 
 def test_netcdf_by_xarray(volumes, tmp_path):

@@ -56,6 +56,13 @@ def test_the_directory_is_complete_and_kept(made, measurement, capsys):
         reconstruct_into(out.path, measurement, QUICK)
 
 
+@pytest.mark.skipif(os.name == "nt", reason="modes of POSIX")
+def test_others_may_read_the_files_as_any_new_file(made, tmp_path):
+    (tmp_path / "new").touch()
+    modes = {path.name: path.stat().st_mode for path in made[0].path.iterdir()}
+    assert modes == dict.fromkeys(modes, (tmp_path / "new").stat().st_mode)
+
+
 def test_the_command_line_takes_run_toml_and_the_model_of_a_result(made, measurement, tmp_path):
     out, path, predicted = made[0], str(tmp_path / "m.nc"), tmp_path / "p.nc"
     measurement.write(path)

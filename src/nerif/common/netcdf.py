@@ -7,14 +7,15 @@ SciPy reads, and 5 with 64-bit data, which it does not.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from nerif.common.conventions import InputError
+from nerif.common.files import atomic
 from nerif.common.hdf5 import open_hdf5
 from nerif.common.memory import check_memory
 
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
 CLASSIC, WIDE = (b"CDF\x01", b"CDF\x02"), b"CDF\x05"
 """First bytes of NetCDF-3 files."""
 
-__all__ = ["opened", "reading", "values"]
+__all__ = ["opened", "reading", "values", "write_dataset"]
 
 
 @contextmanager
@@ -64,6 +65,16 @@ def _dataset(path: Path) -> xr.Dataset:
                 check_memory(item.size * item.dtype.itemsize, path, f"{path}: variable '{name}'")
         file.attrs.get("_nc3_strict")  # where this fails, h5netcdf leaves a half-made object that complains later
     return xr.open_dataset(path, engine="h5netcdf", decode_times=False, phony_dims="sort")
+
+
+def write_dataset(path: str | os.PathLike[str], dataset: xr.Dataset, encoding: Mapping[str, Any] | None = None) -> None:
+    """Write a NetCDF-4 file atomically.
+
+    It is made in memory: the HDF5 library crashes where it cannot write its last bytes, as on a full disk.
+    """
+    content = dataset.to_netcdf(engine="h5netcdf", encoding=encoding)
+    with atomic(path) as part:
+        part.write_bytes(content)
 
 
 def values(variable: xr.DataArray) -> np.ndarray:

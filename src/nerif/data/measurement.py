@@ -16,8 +16,7 @@ from torch import Tensor
 
 from nerif.common.axis_order import order_remedy
 from nerif.common.conventions import DEFAULT_AMBIENT_FACES, InputError, ambient_index, parse_faces, unit_shown
-from nerif.common.files import atomic
-from nerif.common.netcdf import opened
+from nerif.common.netcdf import opened, write_dataset
 from nerif.data.kinds import MEASUREMENT, reading_as
 from nerif.forward.base import ForwardModel
 from nerif.forward.registry import TECHNIQUES, forward_model
@@ -533,8 +532,7 @@ class Measurement:
         from nerif.data.measurement_file import encoding
 
         dataset = self.to_dataset()
-        with atomic(path) as part:
-            dataset.to_netcdf(part, engine="h5netcdf", encoding=encoding(dataset))
+        write_dataset(path, dataset, encoding(dataset))
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> Measurement:

@@ -16,6 +16,7 @@ import torch
 
 from nerif.common.conventions import FACES
 from nerif.common.files import atomic
+from nerif.common.netcdf import write_dataset
 from nerif.data.volume import Volume, describe
 from nerif.geometry.symmetry import Symmetry
 
@@ -87,8 +88,7 @@ class Meridian:
 
     def write(self, path: str | os.PathLike[str]) -> None:
         """Write a NetCDF file, atomically."""
-        with atomic(path) as part:
-            self.to_dataset().to_netcdf(part, engine="h5netcdf")
+        write_dataset(path, self.to_dataset())
 
     def write_csv(self, path: str | os.PathLike[str]) -> None:
         """Write one line per point: r and h in mm, and every quantity."""

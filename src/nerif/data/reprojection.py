@@ -12,8 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerif.common.conventions import InputError, with_unit
-from nerif.common.files import atomic
-from nerif.common.netcdf import opened
+from nerif.common.netcdf import opened, write_dataset
 from nerif.data.measurement import Measurement
 from nerif.data.measurement_file import encoding, from_dataset, to_dataset
 from nerif.forward.base import ForwardModel
@@ -97,8 +96,7 @@ class Reprojection:
             dataset.attrs["predicted_by"] = accuracy.method
             if accuracy.technique.measured in dataset:  # displacements of a measurement of images only
                 dataset[accuracy.technique.measured].attrs["predicted_error"] = accuracy.error
-        with atomic(path) as part:
-            dataset.to_netcdf(part, engine="h5netcdf", encoding=encoding(dataset))
+        write_dataset(path, dataset, encoding(dataset))
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> Reprojection:

@@ -10,8 +10,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from nerif.common.files import atomic
-from nerif.common.netcdf import opened, values
+from nerif.common.netcdf import opened, values, write_dataset
 from nerif.data.volume import describe
 from nerif.data.vti import write_vtp
 
@@ -53,8 +52,7 @@ class SurfaceMap:
             },
             attrs=self.attributes,
         )
-        with atomic(path) as part:
-            dataset.to_netcdf(part, engine="h5netcdf")
+        write_dataset(path, dataset)
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> SurfaceMap:

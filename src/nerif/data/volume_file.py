@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from nerif.common.conventions import LARGEST_INDEX, LARGEST_LENGTH, STATISTICS, InputError
-from nerif.common.files import atomic, ending
-from nerif.common.netcdf import opened, values
+from nerif.common.files import ending
+from nerif.common.netcdf import opened, values, write_dataset
 from nerif.data.kinds import VOLUME, reading_as
 from nerif.data.volume import QUANTITIES, Volume, describe, field_of, name_of
 from nerif.data.vti import read_vti
@@ -33,8 +33,7 @@ def write_netcdf(path: str | os.PathLike[str], volumes: list[Volume]) -> None:
     """Write volumes on one grid to a NetCDF-4 file with CF conventions, coordinates in mm, atomically."""
     dataset = to_dataset(volumes)
     encoding = {name: {"zlib": True, "complevel": 4} for name in dataset.data_vars}
-    with atomic(path) as part:
-        dataset.to_netcdf(part, engine="h5netcdf", encoding=encoding)
+    write_dataset(path, dataset, encoding)
 
 
 def to_dataset(volumes: list[Volume]) -> xr.Dataset:
