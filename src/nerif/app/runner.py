@@ -56,7 +56,7 @@ def began(pid: int) -> str:
             return f"{process.create_time():.2f}"
         boot, stat = Path("/proc/sys/kernel/random/boot_id"), Path(f"/proc/{pid}/stat")
         ticks = stat.read_bytes().rpartition(b")")[2].split()[19].decode()
-        return f"{boot.read_text()[:8] if boot.is_file() else ''}.{ticks}"
+        return f"{boot.read_text(encoding='utf-8')[:8] if boot.is_file() else ''}.{ticks}"
     except (psutil.Error, OSError):
         return ""
 

@@ -114,7 +114,7 @@ def atomic(path: str | os.PathLike[str]) -> Iterator[Path]:
         _replace(part, path)
         written.append(path)
     except OSError as error:
-        if error.errno in DISK_FULL:
+        if error.errno is not None and error.errno in DISK_FULL:
             error.filename, error.strerror = str(path), os.strerror(error.errno)  # libraries name none, or the part
         raise
     finally:

@@ -58,7 +58,7 @@ def if_interrupted(message: Callable[[], str]) -> Iterator[None]:
     except KeyboardInterrupt:
         raise Interrupted(message()) from None
     except OSError as error:
-        if error.errno not in DISK_FULL:
+        if error.errno is None or error.errno not in DISK_FULL:
             raise
         raise DiskFull(error.errno, f"{os.strerror(error.errno)}; {message()}", error.filename) from error
 

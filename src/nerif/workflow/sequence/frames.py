@@ -61,7 +61,7 @@ def reconstruct_frames(plan: SequencePlan, first: int, last: int, event: Event =
     watch = end_without(os.getppid())
     previous: NeuralField | None = None
     for index in range(first, last):
-        status = store.read("status", index)
+        status = int(store.read("status", index))
         if status == MISSING:
             event({"frame": index, "what": "begun"})
             try:
