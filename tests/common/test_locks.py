@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from commands import run
 from nerif.common.locks import LOCK, locked
 from refusals import refused
 
@@ -62,6 +63,22 @@ def test_waiting_for_the_other(held):
     with locked(out, inside, wait=True):
         pass
     assert process.wait(20) == 0
+
+
+@pytest.mark.parametrize(
+    ("line", "inside"),
+    [
+        ("simulate -o {out}/new.zarr --times 0:1e-3:2 --views 3 --image-size 6 8 --truth-voxels 5", False),
+        ("render -o {out}/new.zarr --views 3 --image-size 6 8", True),
+    ],
+)
+def test_commands_hold_the_lock(line, inside, tmp_path, capsys):
+    if "times" in line:
+        pytest.importorskip("zarr", reason="pip install '.[sequence]'")
+    with locked(tmp_path / "new.zarr", inside):
+        assert run(*line.format(out=tmp_path).split()) == 2
+    assert "another run writes to it" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_file_system_without_locks(tmp_path, monkeypatch):

@@ -126,6 +126,10 @@ def test_an_interrupted_run_continues_from_its_checkpoint(film: Path, tmp_path: 
     settings, out = VelocityFit(resolution=12, max_iterations=12, time_limit=0, samples=0), tmp_path / "v.zarr"
 
     def stop(iterate: Iterate) -> None:
+        if iterate.iterations == 3:
+            with refused(out) as another:
+                velocity_of_film(film, out, settings)
+            assert "another run writes to it" in str(another.value)
         if iterate.iterations == 6:
             raise KeyboardInterrupt
 

@@ -32,6 +32,7 @@ pytest.importorskip("distributed", reason="pip install '.[sequence]'")
 from nerif import __version__
 from nerif.cli.cli import main
 from nerif.common.conventions import InputError
+from nerif.common.locks import locked
 from nerif.data.measurement_sequence import MeasurementSequence
 from nerif.workflow.sequence import cluster
 from nerif.workflow.sequence.cluster import _gpus, check_workers, open_cluster, read_slurm, slurm_cluster
@@ -489,6 +490,13 @@ def test_invalid_options(arguments, words, five, tmp_path, capsys, monkeypatch):
     assert main(["sequence", str(five), "-o", "o.zarr", *QUICK, *arguments.split()]) == 2
     assert words in capsys.readouterr().err
     assert "cluster" in words or not list(tmp_path.iterdir())
+
+
+def test_a_store_that_another_run_writes_is_left_alone(five, tmp_path, capsys):
+    with locked(tmp_path / "o.zarr"):
+        assert main(["sequence", str(five), "-o", str(tmp_path / "o.zarr"), *QUICK, "--force"]) == 2
+    assert "another run writes to it" in capsys.readouterr().err
+    assert not (tmp_path / "o.zarr").exists()
 
 
 def test_a_store_begun_with_other_settings_is_left_alone(five, tmp_path, capsys):
