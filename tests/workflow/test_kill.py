@@ -46,7 +46,7 @@ def reconstruct(out: Path, data: Path, method: str, stage: str = "") -> None:
     for step in (*STEPS, *CLOSING):
         if step.__name__ == stage:
             step.run = staticmethod(lambda job: os.kill(os.getpid(), signal.SIGKILL))  # type: ignore[method-assign]
-    reconstruct_into(out, data, METHODS[method], RUN, voxels=16, resume=out.exists())
+    reconstruct_into(out, data, METHODS[method], RUN, voxels=16, resume=(out / "run.toml").exists())
 
 
 def run(*arguments: object, seconds: float | None = None) -> int | None:

@@ -20,6 +20,7 @@ __all__ = ["LOCK", "locked"]
 
 LOCK = ".nerif.lock"
 HELD = (errno.EAGAIN, errno.EACCES)  # by another process; other errors: a file system without locks
+ATTEMPTS = 1000  # at a lock that its holders remove; a few network file systems number a file differently each time
 BYTE = 1 << 30  # that is locked on Windows, where nobody can read a locked byte: behind the text
 
 
@@ -54,7 +55,7 @@ def locked(out: Path, inside: bool = False, wait: bool = False) -> Iterator[None
 
 def _acquired(lock: Path, out: Path, wait: bool) -> int:
     """Return the open lock file, which is locked and says by whom."""
-    while True:
+    for last in [False] * ATTEMPTS + [True]:
         lock.parent.mkdir(parents=True, exist_ok=True)
         try:
             file = os.open(lock, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o666)
@@ -70,11 +71,12 @@ def _acquired(lock: Path, out: Path, wait: bool) -> int:
                     f"another run writes to it ({holder}); wait for its end, stop it, or give another --out", field=out
                 ) from None
         with suppress(FileNotFoundError):
-            if os.path.samestat(os.fstat(file), os.stat(lock)):
+            if last or os.path.samestat(os.fstat(file), os.stat(lock)):
                 os.ftruncate(file, 0)
                 os.write(file, f"process {os.getpid()} on {platform.node()}".encode())
                 return file
         os.close(file)  # of a holder that has just removed it
+    raise OSError(errno.EIO, "cannot be made", str(lock))
 
 
 def _lock(file: int, wait: bool) -> None:
