@@ -19,6 +19,7 @@ from nerif.analysis.prediction import reproject
 from nerif.analysis.surface import surface_map
 from nerif.analysis.verdict import verdict
 from nerif.common.conventions import unit_shown
+from nerif.common.installation import word_of
 from nerif.data.measurement import Measurement
 from nerif.data.volume import describe, quantities_of
 from nerif.geometry import Grid
@@ -411,7 +412,7 @@ class WriteReport(PipelineStep):
             write_report(job.out.path, monitor=job.monitor)
         except Exception as error:  # of a figure, or of a full disk: the result is complete without it
             reason = f"{type(error).__name__}: {error}"
-            job.monitor.say(f"report: not written ({reason}); write it by nerif report {job.out.path}")
+            job.monitor.say(f"report: not written ({reason}); write it by nerif report {word_of(job.out.path)}")
 
 
 STEPS: tuple[type[PipelineStep], ...] = (
