@@ -35,7 +35,7 @@ from nerif.forward.path_integral import PathIntegral, project
 from nerif.forward.registry import AUTO, forward_models
 from nerif.geometry import Grid
 from nerif.geometry.symmetry import Axis
-from nerif.reconstruction.aperture import apply_aperture
+from nerif.reconstruction.aperture import apply_aperture, over_pixels
 from nerif.reconstruction.bounds import field_bounds
 from nerif.reconstruction.device import resolve_device
 from nerif.reconstruction.gauge import with_gauge
@@ -168,6 +168,8 @@ class Detail:
         self.layout = layout_of(self.measurement, axis, device=resolve_device(settings.device))
         self.device = self.layout.device
         fine = self.layout.grid(voxels or voxels_of(self.measurement))
+        if voxels is not None:
+            self.measurement = over_pixels(self.measurement, fine)
         self.bins = coarse * bins_of(self.measurement, fine, voxels=1.0)
         self.grid = self.layout.grid(max(1, max(fine.shape) // coarse))
 

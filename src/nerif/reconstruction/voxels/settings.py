@@ -20,6 +20,7 @@ from nerif.data.measurement import Measurement
 from nerif.fields.base import Field
 from nerif.forward.registry import AUTO, MODEL_NAMES
 from nerif.geometry import Grid
+from nerif.reconstruction.aperture import over_pixels
 from nerif.reconstruction.base import OnStep, Reconstruction, State
 from nerif.reconstruction.shared_settings import SHORT_RUN, SharedSettings, Source
 from nerif.reconstruction.voxels import kernels_torch
@@ -151,7 +152,7 @@ def _ray_counts(measurement: Measurement, grid: Grid) -> list[tuple[int, int]]:
 
 def _lens_rays(measurement: Measurement, grid: Grid) -> int:
     """Return the largest number of rays per pixel, from a lattice of pixels of each image."""
-    most = 1
+    most, measurement = 1, over_pixels(measurement, grid)
     for camera in measurement.cameras:
         lattice = [torch.linspace(0, n - 1, min(n, 9), dtype=camera.intrinsics.dtype) for n in camera.image_size[::-1]]
         rays = camera.rays(torch.cartesian_prod(*lattice).reshape(-1, 2)).clip(measurement.box)
