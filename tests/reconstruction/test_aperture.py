@@ -201,8 +201,8 @@ def test_the_error_does_not_rise_with_the_voxels():
     """With a line of sight per pixel, steps at these lines alone explain the data, and the field is too flat."""
     ring = Ring(views=4, arc=(0.0, 135.0), image_size=(8, 10), pixel_pitch=0.45)
     pixels = [replace(camera, lens=Lens(window=1.0, points=9)) for camera in ring.cameras()]
-    truth, m = make_phantom("gaussians", BOX, 2), simulate(make_phantom("gaussians", BOX, 2), pixels, BOX, 1.00027, 0.02)
-    m = apply_aperture(m, "off")
+    truth = make_phantom("gaussians", BOX, 2)
+    m = apply_aperture(simulate(truth, pixels, BOX, 1.00027, 0.02), "off")
     grid = Grid.of_resolution(BOX, 24)
     exact, settings = truth.sample(grid), {"regularisation": 0.002, "iterations": 20, "coarse_to_fine": False}
     errors, fields = [], []

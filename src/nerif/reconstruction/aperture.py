@@ -52,8 +52,8 @@ def over_pixels(measurement: Measurement, grid: Grid) -> Measurement:
     slices |= min(measurement.box.edges) < 2 * max(measurement.pixel_sizes)
     if slices or max(lens.window for lens in lenses) >= 1 or APART * pixels_in_a_voxel(measurement, grid) >= 1:
         return measurement
-    cameras = zip(measurement.cameras, lenses, strict=True)
-    return replace(measurement, cameras=tuple(replace(camera, lens=replace(lens, area=1.0)) for camera, lens in cameras))
+    pairs = zip(measurement.cameras, lenses, strict=True)
+    return replace(measurement, cameras=tuple(replace(c, lens=replace(lens, area=1.0)) for c, lens in pairs))
 
 
 def lens_rays(measurement: Measurement, count: int = 0) -> int:

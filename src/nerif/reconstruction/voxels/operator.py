@@ -23,7 +23,7 @@ __all__ = ["VoxelOperator", "apply_rows", "check_step", "operator_norm", "rays_t
 MAX_STEP = {"linear": 0.5, "cubic": 1.0}
 # of rays through a lens, per voxel of the cone's radius in the middle of the box; of a pixel
 PAIRS_PER_VOXEL, MAX_PAIRS = 2.0, 8
-APART = 1.35  # voxels between neighbouring lines of sight, at most: between wider ones a step has no data (064)
+APART = 1.35  # voxels between neighbouring lines of sight, at most (docs/decisions/064)
 
 
 class VoxelOperator:
@@ -190,15 +190,14 @@ def rays_through(rays: Rays, length: float) -> int:
 
 
 def _raster(rays: Rays, length: float) -> int:
-    """Return the rays along an edge of a pixel whose area the voxels resolve, by the view of the widest pixels; or 0."""
+    """Return the rays along an edge of a pixel with an area, by the view of the widest pixels; 0 without one."""
     if rays.lens is None or not rays.lens.raster:
         return 0
-    rays = rays[rays.crosses]
+    on_disc, rays = bool(rays.lens.radius.any()), rays[rays.crosses]
     width = 2 * rays.half_window(0.5 * (rays.near + rays.far))
     widest = max((float(width[rays.view == view].mean()) for view in rays.view.unique()), default=0.0)
     points = max(1, math.ceil(widest / (APART * length)))
-    # an even number of points on the disc of a lens
-    return points + points % 2 if points > 1 and bool(rays.lens.radius.any()) else points
+    return points + points % 2 if points > 1 and on_disc else points  # points on a disc are even in number
 
 
 def check_step(step: float, basis: str) -> None:
