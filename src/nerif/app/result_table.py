@@ -85,7 +85,7 @@ def _row_of_film(project: Project, name: str) -> Row | None:
     except InputError:
         return None
     count, done = len(store), len(finished_frames(store))
-    span = f"{store.times[0]:g} to {store.times[-1]:g} s" if count else ""
+    span = f"{store.times[0]:.10g} to {store.times[-1]:.10g} s" if count else ""
     outcome = "complete" if done == count else f"{done} of {count} frames"
     grid = " × ".join(str(n) for n in store.grid.shape[::-1])
     figures = (("Frames", f"{done} of {count}"), ("Time", span), ("Voxels", f"{grid} (x, y, z)"))

@@ -91,7 +91,7 @@ class ResultView:
             self.play.props["aria-label"] = "Play or pause the film"
 
             def text(step: int) -> str:
-                return f"{source.times[source.frames[step]] * 1e3:.4g} ms (frame {source.frames[step] + 1})"
+                return f"{source.times[source.frames[step]] * 1e3:.10g} ms (frame {source.frames[step] + 1})"
 
             self.time = RangeSlider("Time", len(source.frames) - 1, 0, text, move)
 
@@ -172,7 +172,7 @@ class ResultView:
         now = source.times[source.frames[step]]
         nearest = min(other.frames, key=lambda frame: abs(other.times[frame] - now))
         if abs(other.times[nearest] - now) > CLOSE * min(_interval(source.times), _interval(other.times)):
-            at, closest = (f"{time * 1e3:.4g} ms" for time in (now, other.times[nearest]))
+            at, closest = (f"{time * 1e3:.10g} ms" for time in (now, other.times[nearest]))
             raise InputError(
                 f"expected a frame at {at} to compare with, got {closest} as the nearest complete frame; "
                 "choose another instant",

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     import zarr
     from torch import Tensor
 
-__all__ = ["ZARR_FORMAT", "MeasurementSequence", "add_frames", "check_store", "require_zarr"]
+__all__ = ["ZARR_FORMAT", "MeasurementSequence", "add_frames", "check_instants", "check_store", "require_zarr"]
 
 ZARR_FORMAT: Final = 3
 """Format of every store. Format 2 has filters that unpickle what they read: a foreign store could run code."""
@@ -132,8 +132,7 @@ class MeasurementSequence:
             count = dataset.sizes["time"]
             check_memory(BYTES_OF_TIME * count, path, path)
             times = tuple(map(float, values(dataset["time"]).tolist() if "time" in dataset.coords else range(count)))
-        if not _increase(times) or not math.isfinite(sum(times)):
-            raise InputError(f"coordinate time: expected increasing instants in s, got {_short(times)}", field=path)
+        check_instants(times, path)
         return cls(path, times)
 
     def frame(self, index: int) -> Measurement:
@@ -199,8 +198,7 @@ class MeasurementSequence:
         import zarr
 
         path = Path(path)
-        if not _increase(times):
-            raise InputError(f"expected increasing instants in s, got {_short(times)}", field="times")
+        check_instants(times, "times")
         if path.exists() and not force:
             raise InputError("exists already and was left as it is; give another --out, or --force", field=path)
         check_store(path, MEASUREMENTS)
@@ -303,10 +301,10 @@ def _opened(path: Path) -> xr.Dataset:
         )
 
 
-def _increase(times: Sequence[float]) -> bool:
-    return len(times) > 0 and all(b > a for a, b in pairwise(times))
-
-
-def _short(times: Sequence[float]) -> str:
-    start = ", ".join(f"{t:g}" for t in times[:4])
-    return f"{start}, ..." if len(times) > 4 else start or "none"
+def check_instants(times: Sequence[float], field: str | Path) -> None:
+    """Raise InputError unless there are instants, finite and each later than the one before."""
+    if len(times) and all(b > a for a, b in pairwise(times)) and math.isfinite(sum(times)):
+        return
+    first = next((k for k, (a, b) in enumerate(pairwise(times)) if not b > a), 0)
+    short = ", ".join(map(repr, map(float, times[first : first + 4]))) or "none"
+    raise InputError(f"coordinate time: expected increasing instants in s, got {short} from frame {first}", field=field)

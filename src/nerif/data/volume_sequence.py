@@ -13,7 +13,7 @@ from nerif.common.files import atomic
 from nerif.common.memory import check_memory
 from nerif.common.netcdf import reading
 from nerif.data.kinds import SEQUENCE_RESULT, TRUE_SEQUENCE, Kind, check_kind, reading_as
-from nerif.data.measurement_sequence import ZARR_FORMAT, add_frames, check_store, require_zarr
+from nerif.data.measurement_sequence import ZARR_FORMAT, add_frames, check_instants, check_store, require_zarr
 from nerif.data.volume import Volume, describe, field_of, name_of
 from nerif.data.volume_file import REFERENCES
 from nerif.forward.base import ForwardModel
@@ -89,6 +89,7 @@ class VolumeSequence:
             box = Box(tuple(self.attributes["box_lower_mm"]), tuple(self.attributes["box_upper_mm"]))
             self.n_ambient = ambient_index(self.attributes["n_ambient"])
             self.grid = Grid(box, (z, y, x))
+        check_instants(self.times, path)
 
     @classmethod
     def create(
@@ -114,6 +115,7 @@ class VolumeSequence:
         import zarr
 
         check_store(Path(path), FIELDS)
+        check_instants(times, "times")
         axes = {a: (a, grid.axis(a).numpy(), {"units": "mm", "axis": a.upper()}) for a in "zyx"}
         fixed = xr.Dataset(
             coords={"time": ("time", np.array(times, dtype=np.float64), {"units": "s", "axis": "T"}), **axes},

@@ -93,7 +93,8 @@ class Flame(Field):
         self.wave_vectors = (2 * math.pi / wavelength)[:, None] * unit  # 1/mm
         turnover = (2 * math.pi / self.lifetime) * (wavelength / self.longest) ** (-2 / 3)  # inertial range
         drift = turnover * (2 * uniform(self.waves) - 1)
-        self.phases = 2 * math.pi * uniform(self.waves) - (self.wave_vectors[:, 2] * self.speed + drift) * time
+        phases = 2 * math.pi * uniform(self.waves) - (self.wave_vectors[:, 2] * self.speed + drift) * time
+        self.phases = phases.remainder(2 * math.pi)  # single precision does not hold those of late instants
         # velocity ~ wavelength^(1/3) over a turnover time ~ wavelength^(2/3): every scale is equally steep
         amplitude = wavelength.clone()
         amplitude = amplitude / (0.5 * amplitude.square().sum()).sqrt()

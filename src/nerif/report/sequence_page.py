@@ -84,7 +84,7 @@ def _frame_rows(store: VolumeSequence, frames: list[int]) -> list[tuple[str, str
     times = store.times
     rows = [
         ("Frames", f"{len(frames)} of {len(store)}"),
-        ("Time", f"{number(times[0] * 1e3, 4)} to {number(times[-1] * 1e3, 4)} ms"),
+        ("Time", f"{times[0] * 1e3:.10g} to {times[-1] * 1e3:.10g} ms"),
     ]
     if len(times) > 1:
         rows.append(("Frames per second", number((len(times) - 1) / (times[-1] - times[0]), 4)))

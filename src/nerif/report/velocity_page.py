@@ -40,7 +40,7 @@ def render_velocity(store: VelocitySequence) -> str:
     arrows, lines = (
         image(partial(draw, store=store, index=middle), 10, 4.6, 10) for draw in (draw_arrows, draw_streamlines)
     )
-    at = f"at {store.times[middle] * 1e3:.4g} ms"
+    at = f"at {store.times[middle] * 1e3:.10g} ms"
     about = store.attributes
     return render_page(
         kind="Velocity from a film",
@@ -108,7 +108,7 @@ def _film_rows(store: VelocitySequence) -> list[tuple[str, str]]:
     times = store.times
     return [
         ("Frames", str(len(store))),
-        ("Time", f"{number(times[0] * 1e3, 4)} to {number(times[-1] * 1e3, 4)} ms"),
+        ("Time", f"{times[0] * 1e3:.10g} to {times[-1] * 1e3:.10g} ms"),
         ("Voxels", " × ".join(str(n) for n in store.grid.shape[::-1])),
     ]
 

@@ -60,7 +60,7 @@ def _rms(values: Tensor, unit: str) -> str:
 def _film(path: Path, film: MeasurementSequence) -> None:
     written = sum(map(film.is_written, range(len(film))))
     say(f"{path}: measurement over time, {written} of {len(film)} instants written")
-    say(f"  times          {film.times[0]:g} to {film.times[-1]:g} s")
+    say(f"  times          {film.times[0]:.10g} to {film.times[-1]:.10g} s")
     _measurement(path, film.fullest())
 
 
