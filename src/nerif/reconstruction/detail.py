@@ -66,6 +66,7 @@ SIGNIFICANT, EARLY = 1.1, 3.0  # sigma: residual above which there is detail; in
 EXPLAINED = 0.7  # of the signal of the field's own detail
 BETTER = 0.99  # of the error of a prediction, at most
 TRIALS = 4  # blurred or not, in one pass or two
+BANDS = 8  # of the withheld pixels, in their order, that choose, and as many between them
 FINE_COST, BLURRED_COST = 28.0, 45.0  # seconds that detail takes over those of a trial; about a blurred field
 
 Watch = Callable[["Posterior"], bool | None]
@@ -275,14 +276,15 @@ class Detail:
             return first
         return self.solve(problem.with_errors(first.residual), watching, iterations)
 
-    def trial(self, problem: WhiteProblem, target: Target) -> tuple[Posterior, float]:
-        """Return a rough posterior, and the lowest error of the prediction of other data on the way to it."""
-        errors: list[float] = []
+    def trial(self, problem: WhiteProblem, choosing: Target, scoring: Target) -> tuple[Posterior, float, float]:
+        """Return a rough posterior, the lowest error of the prediction of data on the way to it, and that of others."""
+        errors: list[tuple[float, float]] = []
 
         def watch(posterior: Posterior) -> None:
-            errors.append(self.prediction_error(target, posterior.coefficients))
+            coefficients = posterior.coefficients
+            errors.append((self.prediction_error(choosing, coefficients), self.prediction_error(scoring, coefficients)))
 
-        return self.solve(problem, watch, TRIAL_ITERATIONS), min(errors)
+        return self.solve(problem, watch, TRIAL_ITERATIONS), *min(errors)
 
     def others(self, measurement: Measurement) -> Target:
         """Return the data of other views, as those of this one."""
@@ -320,7 +322,8 @@ class Choice:
     ----------
     blurred : whether the mean is the blurred reconstruction
     passes : 1 or 2; None: two, if the objective is lower then
-    before, after : rms residual of the withheld view over sigma, without and with detail; NaN without such a view
+    before, after : rms residual of the withheld view over sigma, without and with detail, over the bands of its pixels
+        by which nothing was chosen; NaN without such a view
     seconds : that the detail is expected to take
     """
 
@@ -366,18 +369,22 @@ def choose(
 ) -> Choice:  # fmt: skip
     """Return which mean and prior predict the withheld views of a field best, on a coarse grid.
 
+    Every second band of their pixels chooses; the others tell how good the prediction is.
+
     Parameters
     ----------
     most : seconds that the detail may take; once it is expected to take more, no further trial is made
     """
     target, start = coarse.others(withheld), time.perf_counter()
-    best = Choice(before=coarse.prediction_error(target, coarse.mean(blurred=False)), after=math.inf)
-    posterior: Posterior | None = None
+    band = torch.arange(len(target)) * 2 * BANDS // max(len(target), 1)
+    choosing, scoring = (target[(band % 2 == half).nonzero()[:, 0]] for half in (0, 1))
+    best = Choice(before=coarse.prediction_error(scoring, coarse.mean(blurred=False)), after=math.inf)
+    lowest, posterior = math.inf, None
     for trial, (blurred, passes) in enumerate(itertools.product((False, True), (1, 2)), start=1):
         problem = coarse.next(posterior) if posterior and passes == 2 else coarse.first(blurred)
-        posterior, error = coarse.trial(problem, target)
-        if error < best.after:
-            best = replace(best, blurred=blurred, passes=passes, after=error)
+        posterior, error, after = coarse.trial(problem, choosing, scoring)
+        if error < lowest:
+            lowest, best = error, replace(best, blurred=blurred, passes=passes, after=after)
         cost = BLURRED_COST if best.blurred else FINE_COST
         best = replace(best, seconds=cost * (time.perf_counter() - start) / trial)
         on_done(trial, TRIALS)

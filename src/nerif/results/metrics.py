@@ -132,7 +132,8 @@ class DetailEntries(TypedDict):
     """Rms over sigma, without and with it."""
     residual_after: float
     withheld_before: Score
-    """The same of the withheld view in the cross-validation; NaN without one."""
+    """The same of the withheld view in the cross-validation: of rough trials on a coarse grid, and of pixels by which
+    nothing was chosen. NaN without one."""
     withheld_after: Score
     blurred: bool
     """Whether it was added to the blurred field."""

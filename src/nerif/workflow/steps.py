@@ -135,7 +135,7 @@ class ChooseDetail(PipelineStep):
         with job.monitor.counting("choosing the detail") as bar:
             choice = choose(coarse, withheld, math.inf if on else MOST_BLURRED * left, bar)
         errors = f"{choice.before:.2f} sigma without it, {choice.after:.2f} with it"
-        job.monitor.say(f"detail: the withheld view is predicted to {errors}")
+        job.monitor.say(f"detail: residual of the withheld view, on pixels by which nothing was chosen, {errors}")
         if choice.seconds > share(job, choice) * left and not on:
             job.monitor.say(f"detail left out: it takes about {choice.seconds:.0f} s; give a longer --time-limit")
             return None

@@ -26,6 +26,7 @@ from torch import Tensor
 
 from nerif.common.conventions import InputError
 from nerif.common.settings import Count, Positive, check_settings
+from nerif.data.measurement_sequence import check_instants
 from nerif.geometry import Grid
 from nerif.reconstruction.velocity.deviations import deviations_of
 from nerif.reconstruction.velocity.flow import Flow
@@ -45,6 +46,7 @@ STAGES = ((0.67, 0.1), (1.0, 0.8))
 REPEATED_STAGES = ((0.67, 0.08), (0.67, 0.22), (1.0, 0.48), (1.0, 0.8))
 """The same where the density is improved between stages, or the noise estimated from a velocity on the same grid."""
 MIN_VOXELS = 8  # along the longest edge of the velocity
+ENOUGH = 0.7  # rms of residual / sigma (1 at the true velocity) at which a stage ends: half of the noise is fitted
 IMPROVEMENT = 0.4  # of the time left to a stage, for better densities before it
 SAMPLED = 0.5  # voxels along an edge of the grid of standard deviations, relative to the finest
 
@@ -176,7 +178,9 @@ class VelocityFit:
             def progress(misfit: float, best: Tensor, done: int, state: State = state) -> float:
                 return report("velocity", misfit, replace(state, controls=best, iterations=done))
 
-            controls, done = minimise(problem, controls, self.max_iterations, state.iterations, end * limit, progress)
+            controls, done = minimise(
+                problem, controls, self.max_iterations, state.iterations, end * limit, progress, enough=ENOUGH
+            )
             state = replace(state, controls=controls, iterations=done)
         assert problem is not None
         flow = problem.flow(_controls(state))
@@ -197,10 +201,12 @@ class VelocityFit:
         Raises
         ------
         InputError
-            For less than three frames, thin boxes, NaN, densities that do not vary, and those outside the physics.
+            For less than three frames, instants that do not increase, thin boxes, NaN, densities that do not vary, and
+            those outside the physics.
         """
         if len(times) < 3:
             raise InputError(f"expected three frames or more, got {len(times)}", field="film")
+        check_instants(times, "film")
         if tuple(theta.shape) != (len(times), *grid.shape):
             raise InputError(f"expected densities of shape {(len(times), *grid.shape)}, got {tuple(theta.shape)}")
         if any(n < fewest for n, fewest in zip(grid.shape, box_of.fewest, strict=True)):

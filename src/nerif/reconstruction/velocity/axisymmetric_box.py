@@ -72,7 +72,7 @@ class AxisymmetricBox(PeriodicBox):
     def solenoidal(self, spectrum: Complex[Tensor, "3 z y xr"]) -> Complex[Tensor, "3 z y xr"]:
         a, b = self._coefficients(spectrum)
         divergence = (self._kr * a + 1j * self._kz * b) * self._inverse
-        return self._vectors(a - self._kr * divergence, b + 1j * self._kz * divergence)
+        return self._vectors(a - self._kr * divergence, (b + 1j * self._kz * divergence) * (self._square > 0))
 
     def potential(self, spectrum: Complex[Tensor, "3 z y xr"]) -> Complex[Tensor, "z y xr"]:
         a, b = self._coefficients(spectrum)

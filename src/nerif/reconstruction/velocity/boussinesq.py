@@ -3,8 +3,12 @@
     du/dt + u . grad u = -grad p + nu lap u - theta g,      div u = 0,      theta = -(rho - rho_0) / rho_0
 
 Semi-Lagrangian, of second order: the fluid that arrives at a node brings its velocity, and half of the force on it,
-from where it was, found by the midpoint rule on cubic splines of the velocity halfway in time. Pressure by projection,
-viscosity exactly in Fourier space.
+from where it was, found by the midpoint rule on cubic splines of the velocity halfway in time. Viscosity, exactly in
+Fourier space, acts on what is brought; the half of the force at arrival follows. Pressure by projection.
+
+The net flux through the periodic box is 0 at all instants, as in a closed vessel: velocities follow from vorticity, and
+the mean of the buoyancy is balanced by a mean gradient of pressure. In the open, where the air flows back far away, the
+margins hold the return flow (decision 061).
 
 Source: Staniforth & Cote, Mon. Weather Rev. 119 (1991) 2206; Chorin, Math. Comput. 22 (1968) 745.
 """
@@ -62,17 +66,19 @@ class Boussinesq:
         """
         box, velocities = self.box, [start + self._expansion(theta[0])]
         pressed = self._pressed(velocities[0], theta[0], (theta[1] - theta[0]) / intervals[0])
-        buoyancy = self._buoyancy(theta)
-        splines = box.spline(box.spectrum(buoyancy))
+        of_buoyancy = box.spectrum(self._buoyancy(theta))
+        splines = box.spline(of_buoyancy)
         for k, seconds in enumerate(intervals):
             halfway = velocities[-1]
             if k > 0:
                 halfway = halfway + 0.5 * seconds / intervals[k - 1] * (velocities[-1] - velocities[-2])
             brought = box.spline(velocities[-1] - 0.5 * seconds * pressed)
             moved = self._from_before(halfway, torch.cat([brought, splines[k, None]]), seconds)
-            force = 0.5 * (moved[3] + buoyancy[k + 1])
-            pushed = box.spectrum(moved[:3] - seconds * self.gravity * force)
-            velocity, pressed = self._projected(pushed, theta[k], theta[k + 1], seconds, pressed)
+            half = 0.5 * seconds * self.gravity
+            brought = self._diffused(box.spectrum(moved[:3] - half * moved[3]), theta[k + 1], seconds)
+            velocity, pressed = self._projected(
+                brought - half * of_buoyancy[k + 1], theta[k], theta[k + 1], seconds, pressed
+            )
             if changes is not None:
                 velocity = velocity + changes[k]
             velocities.append(velocity)
@@ -120,7 +126,7 @@ class Boussinesq:
         self, pushed: Spectrum, before: Float[Tensor, "z y x"], now: Float[Tensor, "z y x"], seconds: float,
         pressed: Spectrum,
     ) -> tuple[Spectrum, Spectrum]:  # fmt: skip
-        """Velocity after pressure and viscosity, and -(acceleration by pressure).
+        """Velocity after pressure, and -(acceleration by pressure).
 
         Parameters
         ----------
@@ -129,8 +135,12 @@ class Boussinesq:
         pressed : an interval before
         """
         velocity = self.box.solenoidal(pushed)
+        return velocity, (pushed - velocity) / (0.5 * seconds)
+
+    def _diffused(self, velocity: Spectrum, now: Float[Tensor, "z y x"], seconds: float) -> Spectrum:
+        """Velocity after viscosity, at the place of arrival; `now` is theta there."""
         amount = self.viscosity * seconds
-        return self.box.filtered(velocity, lambda k2: torch.exp(-amount * k2)), (pushed - velocity) / (0.5 * seconds)
+        return self.box.filtered(velocity, lambda k2: torch.exp(-amount * k2))
 
     def _force(self, velocity: Spectrum, theta: Float[Tensor, "z y x"]) -> Float[Tensor, "3 z y x"]:
         """-u . grad u, and buoyancy."""

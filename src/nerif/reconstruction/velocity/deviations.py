@@ -45,8 +45,9 @@ def deviations_of(
         seconds = report(misfit)
         return seconds
 
-    centre, _ = minimise(problem, controls, iterations, 0, limit, progress)
-    problem.weigh(centre)
+    near, _ = minimise(problem, controls, iterations, 0, limit, progress)
+    problem.weigh(near)  # the residual of controls from another grid does not show the noise
+    centre, _ = minimise(problem, near, iterations, 0, limit, progress)
     mean = problem.flow(centre)
     velocity = torch.zeros_like(mean.velocity)
     pressure = None if mean.pressure is None else torch.zeros_like(mean.pressure)

@@ -66,15 +66,14 @@ class LowMach(Boussinesq):
         pressed: Spectrum,
     ) -> tuple[Spectrum, Spectrum]:  # fmt: skip
         temperature, expansion = self._temperature(now), self._expansion(now)
-        pushed = self._diffused(pushed, temperature, seconds)
         wanted = (self._potential_part(pushed) - expansion) / (0.5 * seconds)
         gradient = self.box.values(pressed) / self._temperature(before)
         pressed = self._of_variable_density(wanted, temperature, gradient, LATER)
         return self.box.solenoidal(pushed - 0.5 * seconds * pressed) + expansion, pressed
 
-    def _diffused(self, velocity: Spectrum, temperature: Tensor, seconds: float) -> Spectrum:
+    def _diffused(self, velocity: Spectrum, now: Float[Tensor, "z y x"], seconds: float) -> Spectrum:
         """Velocity after viscosity, between those of the smallest and the largest one."""
-        box, relative = self.box, temperature**HEAT
+        box, relative = self.box, self._temperature(now) ** HEAT
         amount, lowest, highest = self.viscosity * seconds, float(relative.min()), float(relative.max())
         least = box.filtered(velocity, lambda k2: torch.exp(-amount * lowest * k2))
         if not highest > lowest:

@@ -82,9 +82,9 @@ class PeriodicBox:
         return self.values(spectrum / self._spline)
 
     def solenoidal(self, spectrum: Complex[Tensor, "3 z y xr"]) -> Complex[Tensor, "3 z y xr"]:
-        """Return vectors without the gradient in them: those of divergence 0 that are nearest."""
+        """Return vectors without the gradient in them: those of divergence 0, and mean 0, that are nearest."""
         divergence = (self.wave * spectrum).sum(dim=0)
-        return spectrum - self.wave * (divergence * self.inverse_square)
+        return (spectrum - self.wave * (divergence * self.inverse_square)) * (self.wave_square > 0)
 
     def potential(self, spectrum: Complex[Tensor, "3 z y xr"]) -> Complex[Tensor, "z y xr"]:
         """Return the potential of the gradient in vectors, of mean 0: lap p = div v."""

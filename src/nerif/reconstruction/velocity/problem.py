@@ -24,6 +24,7 @@ from nerif.reconstruction.velocity.resampling import (
     averages,
     periodic_averages,
     periodic_splines,
+    smooth,
     squared_slope,
 )
 from nerif.reconstruction.velocity.transport import Transport
@@ -34,14 +35,14 @@ if TYPE_CHECKING:
 __all__ = ["Problem", "Sample", "minimise", "resampled"]
 
 HISTORY = 60  # steps that L-BFGS remembers
-ENOUGH = 0.7  # rms of residual / sigma at which a stage ends
+CALM = (2.0, 2.0, 2.0)  # voxels of the velocity over which the scalar is compared
 FREE_FORCING = 0.5  # change of vorticity per interval, relative to its largest value, without an equation of momentum
 GAINS = 2.0  # vorticity, relative to that of a flow which changes the density at the rate in the film
 
 
 @dataclass(frozen=True)
 class Sample:
-    """Noise of residual / sigma, and controls: both white."""
+    """Noise of residual / sigma, and white controls."""
 
     residual: Float[Tensor, "k z y x"]
     controls: Float[Tensor, "t 3 zp yp xp"]
@@ -105,13 +106,14 @@ class Problem:
         misfit = float(residual.detach()[self.transport.core].square().mean().sqrt())
         if noise is not None:
             residual, controls = residual - noise.residual, controls - noise.controls
-        return 0.5 * residual.square().sum() + 0.5 * controls.square().sum(), misfit
+        squares = residual.square().sum() / self.transport.overlap
+        return 0.5 * squares + 0.5 * controls.square().sum(), misfit
 
     def sample(self, generator: torch.Generator) -> Sample:
         """Return a sample of the noise of the residual, and of the controls a priori."""
-        residual = self.box.white(self.transport.deviation.shape, False, generator)
+        residual = self.transport.sample(generator)
         controls = self.box.white((len(residual) + 1, 3, *self.box.shape), True, generator)
-        return Sample(residual, controls)
+        return Sample(residual / self.transport.deviation, controls)
 
     @torch.no_grad()
     def flow(self, controls: Tensor) -> Flow:
@@ -122,8 +124,8 @@ class Problem:
         misfit = float(residual[self.transport.core].square().mean().sqrt())
         pressure = momentum = None
         if self.settings.physics != "transport":
-            vorticity = self.prior.vorticity(controls)
-            change = torch.stack([box.inside(box.values(box.velocity(w))) for w in vorticity[1:]])
+            forcing = self.prior.vorticity(controls)[1:] * (1 - box.margins())  # there it stands for the flow outside
+            change = torch.stack([box.inside(box.values(box.velocity(w))) for w in forcing])
             momentum = change / intervals[:, None]
             pressure = self.pressure(spectra)
         region = self.transport.region
@@ -141,15 +143,16 @@ class Problem:
 
 def minimise(
     problem: Problem, controls: Tensor, max_iterations: int, before: int, limit: float,
-    report: Callable[[float, Tensor, int], float], noise: Sample | None = None,
+    report: Callable[[float, Tensor, int], float], noise: Sample | None = None, enough: float = 0.0,
 ) -> tuple[Tensor, int]:  # fmt: skip
-    """Return the best controls, and the number of evaluations, until a limit or a residual of the size of sigma.
+    """Return the best controls, and the number of evaluations, until a limit or a residual small enough.
 
     Parameters
     ----------
     before : evaluations so far
     limit : of the figure that report returns
     report : called with the misfit, the best controls and the number of evaluations
+    enough : rms of residual / sigma
     """
     prior = problem.prior
     x = prior.variables(controls).requires_grad_()
@@ -168,7 +171,7 @@ def minimise(
         done += 1
         if loss.item() < lowest:
             best, lowest = z.detach(), loss.item()
-        if report(misfit, best, done) > limit or (noise is None and misfit < ENOUGH):
+        if report(misfit, best, done) > limit or misfit < enough:
             raise _End
         return loss
 
@@ -203,8 +206,15 @@ def resampled(
 
 
 def noise_of(theta: Float[Tensor, "t z y x"], grid: Grid, coarse: Grid) -> float:
-    """Return the standard deviation of a film's averages where the fluid is ambient: where the scalar is smallest."""
-    average = along_axes(theta, averages(grid, coarse))
-    strength = average.abs().amax(dim=0)
+    """Return the standard deviation of a film's averages where the fluid is ambient: where the scalar is smallest.
+
+    From differences of consecutive frames, so that errors which last do not count. The scalar is compared over
+    several voxels: chosen one by one, those of the least noise would be taken for ambient.
+    """
+    matrices = averages(grid, coarse)
+    average = along_axes(theta, matrices)
+    strength = smooth(average.square().mean(dim=0), CALM)
     calm = strength <= strength.quantile(0.5)
-    return float(average[:, calm].square().mean().sqrt())
+    size = along_axes(torch.ones(grid.shape), [m.square() for m in matrices])  # at the faces, of fewer voxels
+    variance = 0.5 * average.diff(dim=0).square().mean(dim=0) * (size.median() / size)
+    return float(variance[calm].mean().sqrt())

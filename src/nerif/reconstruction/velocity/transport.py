@@ -30,6 +30,7 @@ STRONG = 0.05  # of the largest theta
 REACH = 5  # voxels around the scalar at which the residual is evaluated
 MODEL_ERROR = 0.03  # of the local change of theta per interval, that velocities on a grid leave
 ROUNDING = 3.5e-4  # of the largest theta
+BISECTIONS = 20
 
 
 @dataclass(frozen=True)
@@ -67,7 +68,7 @@ class Transport:
         box: PeriodicBox, noise: float = 0.0,
     ) -> None:  # fmt: skip
         self.grid, self.box = grid, box
-        self.intervals = torch.tensor(times).double().diff().float()
+        self.intervals = torch.tensor(times, dtype=torch.float64).diff().float()
         self._down = averages(grid, box.grid)
         self._up = interpolations(box.grid, grid, box.shape, box.first)
         self.fields = [VoxelField.through(volume, grid) for volume in theta]
@@ -82,36 +83,54 @@ class Transport:
             self.places.append(place)
             self.points.append(centres[place])
             self.gains.append(gain[k].reshape(-1)[place])
-        self.core = self.coarse(torch.maximum(theta[1:].abs(), theta[:-1].abs())) > STRONG * largest
+        strong = self.coarse(theta).abs() > STRONG * largest
+        self.core = strong[1:] | strong[:-1]
         """Voxels of the velocity in which much of the scalar is, of each interval: those of the misfit."""
         self.change, self._largest = theta[1:] - theta[:-1], largest
         self._local = smooth(self.coarse(self.change).square(), (2.0, 2.0, 2.0)).clamp_min(0)
-        self._floor = max(noise, ROUNDING * largest)
-        self.deviation = self._deviation(0.0, torch.zeros(()))
-        """Standard deviation of the residual."""
+        self._least = torch.tensor(2 * noise**2 + (ROUNDING * largest) ** 2)  # a difference of two frames
+        self._noise = self._least
+        self.overlap = math.prod(_overlap(matrix) for matrix in self._down)
+        """Residuals for each independent one, as averages share voxels."""
+        """Variance of the residual by the noise of the densities."""
 
     def coarse(self, values: Float[Tensor, "*t z y x"]) -> Float[Tensor, "*t z2 y2 x2"]:
         """Return averages over the voxels of the velocity."""
         return along_axes(values, self._down)
 
-    def _deviation(self, noise: float, by_place: Tensor) -> Tensor:
-        return (by_place.clamp_min(self._floor**2) + (MODEL_ERROR**2 + noise**2) * self._local).sqrt()
+    @property
+    def deviation(self) -> Float[Tensor, "t z y x"]:
+        """Standard deviation of the residual."""
+        return (self._noise + MODEL_ERROR**2 * self._local).sqrt()
 
-    def weigh(self, residual: Float[Tensor, "t z y x"]) -> float:
-        """Estimate the noise of the densities from a residual, and set `deviation`.
-
-        Returns the part of it that grows with the change of density, relative to that.
+    def weigh(self, residual: Float[Tensor, "t z y x"]) -> None:
+        """Estimate the noise of the densities from a residual.
 
         An error of one frame enters the residuals before and after it with opposite signs, so that their covariance is
-        minus its variance; what the velocity does not explain yet has the same sign in both.
+        minus its variance; what the velocity does not explain yet has the same sign in both. Noise above that of the
+        ambient fluid, or that of the place, is taken to grow with the local change of density: by as much as makes the
+        misfit of noise alone 1.
         """
-        variance = -2 * (residual[1:] * residual[:-1]).sum(dim=0) / max(len(residual) - 1, 1)
-        size = max(float(self._local.sum()) / len(self._local), 1e-30)
-        by_place = self.box.noise_by_place(variance)
-        rest = (variance - by_place)[variance != 0]
-        noise = math.sqrt(max(0.0, float(rest.sum())) / size)
-        self.deviation = self._deviation(noise, by_place)
-        return noise
+        variance = -2 * residual[1:] * residual[:-1]
+        by_place = self.box.noise_by_place(variance.mean(dim=0)).maximum(self._least)
+        core = self.core[1:] & self.core[:-1]
+        local = 0.5 * (self._local[1:] + self._local[:-1])
+        low, high = 0.0, float(variance[core].abs().sum() / local[core].sum().clamp_min(1e-30))
+        for _ in range(BISECTIONS):
+            middle = 0.5 * (low + high)
+            if float((variance / (by_place + middle * local))[core].mean()) > 1:
+                low = middle
+            else:
+                high = middle
+        self._noise = by_place + low * self._local
+
+    def sample(self, generator: torch.Generator) -> Float[Tensor, "t z y x"]:
+        """Return a residual of noise: that of the frames, white on their voxels, and that of the equations."""
+        white = self.box.white((2 * len(self.intervals) + 1, *self.grid.shape), False, generator)
+        averages = self.coarse(white)
+        averages = averages / averages.square().mean().sqrt()
+        frames, equations = averages.tensor_split([len(self.intervals) + 1])
+        return (0.5 * self._noise).sqrt() * frames.diff(dim=0) + MODEL_ERROR * self._local.sqrt() * equations
 
     @cached_property
     def region(self) -> Bool[Tensor, "t z y x"]:
@@ -170,3 +189,10 @@ class Transport:
             for a, b in zip(after, before, strict=True)
         ]
         return after, before, inside
+
+
+def _overlap(averages: Float[Tensor, "m n"]) -> float:
+    """Number of averages over that of independent ones whose mean square varies as much, for white noise."""
+    covariance = averages @ averages.T
+    size = covariance.diagonal()
+    return float((covariance.square() / (size[:, None] * size)).sum(dim=1).mean())
