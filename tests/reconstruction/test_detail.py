@@ -105,6 +105,24 @@ def test_the_withheld_view_says_whether_to_blur(plume):
     assert choice.seconds > 0
 
 
+def test_the_error_stated_is_not_the_one_that_chooses(plume, monkeypatch):
+    truth, measurement = plume
+    training, withheld = measurement.without(["0deg"]), measurement.select(["0deg"])
+    coarse = Detail(smoothed(truth, 1.0), training, SETTINGS, coarse=COARSE)
+    errors = iter([(3.0, 0.1), (1.0, 0.9), (2.0, 0.2), (4.0, 0.3)])
+    pixels = []
+
+    def trial(detail, problem, choosing, scoring):
+        pixels.extend([len(choosing), len(scoring), len(detail.others(withheld))])
+        return detail.solve(problem, iterations=1), *next(errors)
+
+    monkeypatch.setattr(Detail, "trial", trial)
+    choice = choose(coarse, withheld)
+    assert (choice.passes, choice.after) == (2, 0.9)
+    assert pixels[0] + pixels[1] == pixels[2]
+    assert pixels[0] == pytest.approx(pixels[1], rel=0.1)
+
+
 def test_only_noise_is_not_significant():
     truth = smoothed(make_phantom("gaussians", BOX, 2), 3.0)
     assert Detail(truth, seen(truth), SETTINGS).residual < SIGNIFICANT

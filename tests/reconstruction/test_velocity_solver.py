@@ -10,6 +10,7 @@ import torch
 from nerif.geometry import Box, Grid
 from nerif.reconstruction.velocity.assimilation import VelocityFit
 from nerif.reconstruction.velocity.boussinesq import Boussinesq
+from nerif.reconstruction.velocity.deviations import deviations_of
 from nerif.reconstruction.velocity.interpolation import periodic_spline
 from nerif.reconstruction.velocity.low_mach import LowMach
 from nerif.reconstruction.velocity.periodic_box import PeriodicBox
@@ -247,3 +248,22 @@ def test_forces_that_stand_for_the_flow_outside_are_no_lack_of_momentum():
     assert inside is not None
     assert outside is not None
     assert float(outside.norm()) < 0.3 * float(inside.norm())
+
+
+def test_samples_have_the_weights_of_their_centre(monkeypatch: pytest.MonkeyPatch):
+    theta, times = puffs(1).expand(5, -1, -1, -1), [STEP * k for k in range(5)]  # at rest, with noise where it is
+    theta = theta + 0.1 * theta * torch.randn(theta.shape, generator=torch.Generator().manual_seed(3))
+    settings = VelocityFit(physics="transport", resolution=8)
+    problem = Problem(settings, theta, PUFF, times, PeriodicBox(Grid(PUFF.box, (9, 7, 8))))
+    weights = []
+
+    def recorded(problem: Problem, controls: torch.Tensor, *_: object) -> tuple[torch.Tensor, int]:
+        weights.append(problem.transport.deviation)
+        return controls, 0
+
+    monkeypatch.setattr("nerif.reconstruction.velocity.deviations.minimise", recorded)
+    deviations_of(problem, torch.zeros(5, 3, *problem.box.shape), 2, 1, lambda misfit: 0.0)
+    before, *after = weights
+    assert len(after) == 3  # the centre and two samples
+    assert not torch.equal(before, after[0])
+    assert all(torch.equal(after[0], other) for other in after)
