@@ -90,9 +90,9 @@ class Transport:
         self._local = smooth(self.coarse(self.change).square(), (2.0, 2.0, 2.0)).clamp_min(0)
         self._least = torch.tensor(2 * noise**2 + (ROUNDING * largest) ** 2)  # a difference of two frames
         self._noise = self._least
+        """Variance of the residual by the noise of the densities."""
         self.overlap = math.prod(_overlap(matrix) for matrix in self._down)
         """Residuals for each independent one, as averages share voxels."""
-        """Variance of the residual by the noise of the densities."""
 
     def coarse(self, values: Float[Tensor, "*t z y x"]) -> Float[Tensor, "*t z2 y2 x2"]:
         """Return averages over the voxels of the velocity."""
