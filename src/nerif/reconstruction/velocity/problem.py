@@ -106,8 +106,7 @@ class Problem:
         misfit = float(residual.detach()[self.transport.core].square().mean().sqrt())
         if noise is not None:
             residual, controls = residual - noise.residual, controls - noise.controls
-        squares = residual.square().sum() / self.transport.overlap
-        return 0.5 * squares + 0.5 * controls.square().sum(), misfit
+        return 0.5 * residual.square().sum() + 0.5 * controls.square().sum(), misfit
 
     def sample(self, generator: torch.Generator) -> Sample:
         """Return a sample of the noise of the residual, and of the controls a priori."""

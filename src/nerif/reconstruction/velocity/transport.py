@@ -8,7 +8,6 @@ than a few voxels are not resolved.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -91,8 +90,6 @@ class Transport:
         self._least = torch.tensor(2 * noise**2 + (ROUNDING * largest) ** 2)  # a difference of two frames
         self._noise = self._least
         """Variance of the residual by the noise of the densities."""
-        self.overlap = math.prod(_overlap(matrix) for matrix in self._down)
-        """Residuals for each independent one, as averages share voxels."""
 
     def coarse(self, values: Float[Tensor, "*t z y x"]) -> Float[Tensor, "*t z2 y2 x2"]:
         """Return averages over the voxels of the velocity."""
@@ -189,10 +186,3 @@ class Transport:
             for a, b in zip(after, before, strict=True)
         ]
         return after, before, inside
-
-
-def _overlap(averages: Float[Tensor, "m n"]) -> float:
-    """Number of averages over that of independent ones whose mean square varies as much, for white noise."""
-    covariance = averages @ averages.T
-    size = covariance.diagonal()
-    return float((covariance.square() / (size[:, None] * size)).sum(dim=1).mean())
