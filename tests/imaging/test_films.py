@@ -21,7 +21,7 @@ from nerif.imaging.readers.cine import TWELVE_BIT
 from nerif.imaging.readers.exposure import full_scale
 from nerif.imaging.readers.frames import Frames, read_each
 from nerif.imaging.readers.open import open_frames
-from nerif.imaging.readers.video import VideoFrames
+from nerif.imaging.readers.video import CONTAINERS, VideoFrames
 from refusals import refused
 
 N, H, W = 5, 6, 16
@@ -168,7 +168,8 @@ def test_avi_of_windows_bitmaps(tmp_path, rng, sign, width):
     np.testing.assert_array_equal(open_frames(tmp_path / "a.avi").single(2), 255 - stack[2])  # at once
 
 
-def test_film_stored_from_the_bottom(tmp_path, rng):
+def test_film_stored_from_the_bottom(tmp_path, rng, monkeypatch):
+    monkeypatch.setitem(CONTAINERS, "format_whitelist", "cine")
     stack = rng.integers(0, 256, (3, H, W)).astype(np.uint8)
     write_cine(tmp_path / "a.cine", [image[::-1].tobytes() for image in stack], H, W, 8, 8)
     same(VideoFrames(tmp_path / "a.cine", "a.cine"), stack)  # FFmpeg has it with a negative step between rows

@@ -62,7 +62,7 @@ def test_the_field_of_the_short_run_is_seen_by_the_cameras_that_it_refined(measu
     assert validation.fit is None
     rows = [dict(zip(GEOMETRY, row, strict=True)) for row in shifts.tolist()]
     rig = [{"name": n, "values": row} for n, row in zip(knocked.names, rows, strict=True) if n != validation.view]
-    grid = Grid.of_resolution(measurement.box, 24)
+    grid = Grid.of_resolution(measurement.box, 18)
     field = VoxelField.through(ball.sample(grid), grid)
     out, outcome = ResultDirectory(tmp_path).cross_validation, Outcome("converged", "")
     out.path.mkdir()

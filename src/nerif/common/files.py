@@ -230,7 +230,7 @@ def read_json(path: Path) -> Any:
     try:
         return json.loads(path.read_text(encoding="utf-8-sig"))
     except (ValueError, RecursionError) as error:
-        raise InputError(f"not a JSON file, or truncated ({error})", field=path) from None
+        raise InputError(f"not a JSON file, or truncated ({error}); write or export it again", field=path) from None
 
 
 def write_json(path: Path, entries: Mapping[str, Any]) -> None:

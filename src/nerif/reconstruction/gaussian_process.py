@@ -64,7 +64,11 @@ class GaussianProcess(SharedSettings):
     ) -> Reconstruction:  # fmt: skip
         begin = time.perf_counter()
         check_sigma(measurement)
-        first = self.first(measurement, on_step, resume, start)
+
+        def watch_first(step: Step) -> bool | None:
+            return None if on_step is None else on_step(replace(step, progress=step.progress / 3))
+
+        first = self.first(measurement, watch_first, resume, start)
         seconds = max(0.0, first.seconds - (time.perf_counter() - begin))  # of earlier parts of a resumed run
         history, stopped = list(first.history), ""
 
@@ -75,8 +79,8 @@ class GaussianProcess(SharedSettings):
             size = float(max(posterior.detail.grid.shape))
             record = {"residual_over_sigma": posterior.residual, "objective": posterior.objective, "voxels": size}
             history.append({"step": history[-1]["step"] + 1, "seconds": now, **record})
-            on_this = sum(1 for record in history if record.get("voxels") == size and "objective" in record)
-            done = (min(1.0, on_this / (2 * self.iterations)) + (posterior.detail.coarse == 1)) / 2
+            on_this = sum(record["voxels"] == size for record in history[len(first.history) :])
+            done = (1 + min(1.0, on_this / (2 * self.iterations)) + (posterior.detail.coarse == 1)) / 3
             rays = len(posterior.problem.target) * posterior.count / max(now, 1e-9)
             count, state = int(history[-1]["step"]), first.state
             assert state is not None
