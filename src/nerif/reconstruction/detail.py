@@ -369,7 +369,7 @@ def choose(
 ) -> Choice:  # fmt: skip
     """Return which mean and prior predict the withheld views of a field best, on a coarse grid.
 
-    Every second band of their pixels chooses; the others tell how good the prediction is.
+    Every second band of their pixels chooses; the stated errors are those of the other bands.
 
     Parameters
     ----------
