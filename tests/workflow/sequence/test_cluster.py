@@ -339,6 +339,16 @@ def test_a_run_without_workers_ends(five, tmp_path, monkeypatch):
     assert "no worker is left" in progress.loss
 
 
+@pytest.mark.parametrize(
+    ("status", "code"), [([DONE, FAILED], 0), ([DONE, MISSING], 1), ([FAILED, FAILED], 1)]
+)  # fmt: skip
+def test_a_command_that_leaves_frames_missing_fails(five, monkeypatch, status, code):
+    from nerif.cli.commands import sequence
+
+    monkeypatch.setattr(sequence, "run", lambda settings: SimpleNamespace(status=np.array(status)))
+    assert main(["sequence", str(five), "-o", "r.zarr"]) == code
+
+
 def test_a_full_disk_fails_no_frame(five, tmp_path, monkeypatch):
     from distributed import Client
 

@@ -18,7 +18,7 @@ from nerif.reconstruction.velocity.assimilation import VelocityFit
 from nerif.workflow.sequence.plan import SequenceSettings
 from nerif.workflow.sequence.reconstruct import reconstruct_sequence
 from nerif.workflow.sequence.run import Progress
-from nerif.workflow.sequence.store import DONE, SequenceStore
+from nerif.workflow.sequence.store import DONE, MISSING, SequenceStore
 
 __all__ = ["Sequence", "main", "run"]
 
@@ -88,5 +88,6 @@ def main(arguments: list[str]) -> None:
     name = setting_of("preset", arguments, "auto")
     reconstructor = preset(name)
     default = Sequence(tyro.MISSING, tyro.MISSING, preset=name, reconstructor=reconstructor)
-    if not (run(read_settings(default, arguments, "sequence")).status == DONE).any():
+    status = run(read_settings(default, arguments, "sequence")).status
+    if (status == MISSING).any() or not (status == DONE).any():
         raise SystemExit(1)
