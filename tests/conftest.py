@@ -134,7 +134,7 @@ def ball() -> Field:
 def cameras() -> tuple[Camera, ...]:
     """Five small views, taller or wider than square, looking slightly down."""
     ring = Ring(
-        views=5, arc=(0.0, 144.0), elevation=8.0, image_size=(20, 26), pixel_pitch=0.11,
+        views=5, arc=(0.0, 144.0), elevation=8.0, image_size=(22, 28), pixel_pitch=0.1,
         distance=700.0, background_distance=450.0,
     )  # fmt: skip
     return ring.cameras()

@@ -167,7 +167,7 @@ def test_swapped_masks_volumes_and_padded_maps_are_named(measurement, tmp_path):
 def test_valid_pixels_are_counted_for_each_technique(measurement):
     """Of their images, padding excluded; named where there are several techniques."""
     d = measurement.displacement.clone()
-    d[0, :, :13] = torch.nan
+    d[0, :, :14] = torch.nan
     half = replace(measurement, displacement=d)
     (o,) = half.observations
     assert half.valid_share(o) == [0.5, 1.0, 1.0, 1.0, 1.0]

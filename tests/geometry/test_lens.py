@@ -110,30 +110,6 @@ def test_rays_over_a_window_are_those_of_its_pixels(projection, diameter):
     assert seen.without_window.lens.window == 0
 
 
-@pytest.mark.parametrize("background", [True, False])
-@pytest.mark.parametrize("projection", sorted(PROJECTIONS))
-def test_rays_over_the_area_of_pixels_form_one_raster(projection, background):
-    """They are the rays of a camera with three times the pixels along an edge."""
-    seen = camera(Lens(area=1.0), projection)
-    seen = seen if background else seen.without_background
-    rays = seen.rays(seen.pixel_grid().reshape(-1, 2)).clip(BOX)
-    through = rays.spread(9, raster=3)
-    pixels = rays.pixel[:, None] + torch.cartesian_prod(*[torch.tensor([-1.0, 0.0, 1.0]).double() / 3] * 2)
-    thin = replace(seen, lens=None).rays(pixels.reshape(-1, 2)).clip(BOX)
-    middle = 0.5 * (rays.near + rays.far).repeat_interleave(9)[:, None]
-
-    def places(rays):
-        return (rays.origin + middle * rays.direction).unflatten(0, (-1, 9))
-
-    apart = (places(through)[:, :, None] - places(thin)[:, None]).norm(dim=-1)
-    size = float(seen.pixel_size(torch.zeros(3).double()))
-    assert float(apart.min(dim=2).values.max()) < 0.01 * size  # each is one of them
-    assert torch.equal(apart.argmin(dim=2).sort(dim=1).values, torch.arange(9).expand(len(rays), 9))
-    half = rays.half_window(0.5 * (rays.near + rays.far))
-    assert float((2 * half / size - 1).abs().max()) < 0.12
-    assert seen.without_window.lens.area == 1.0
-
-
 def test_rays_that_end_in_front_of_the_box_have_no_weight():
     """A background that cuts the box before some of the rays have left it."""
     _, rays, through = spread(Lens(30.0), each=4)

@@ -28,7 +28,7 @@ def camera(projection: str, lens: Lens | None, turn: float) -> Camera:
     return replace(made, projection=PROJECTIONS[projection])
 
 
-@pytest.mark.parametrize("lens", [None, Lens(6.0), Lens(6.0, focus=800.0, area=1.0), Lens(3.0, window=4.0)])
+@pytest.mark.parametrize("lens", [None, Lens(6.0), Lens(6.0, focus=800.0), Lens(3.0, window=4.0)])
 @pytest.mark.parametrize("projection", sorted(PROJECTIONS))
 @pytest.mark.parametrize("background", [True, False])
 def test_rays_move_as_those_of_the_corrected_cameras(projection, lens, background):
@@ -53,8 +53,6 @@ def test_rays_move_as_those_of_the_corrected_cameras(projection, lens, backgroun
         pairs += [(getattr(expected.ends, n), getattr(result.ends, n)) for n in ("sensitivity", "distance")]
     if lens is not None:
         pairs += [(getattr(expected.lens, n), getattr(result.lens, n)) for n in ("axis", "normal", "radius", "focus")]
-        if expected.lens.sensitivity is not None:  # of neighbouring pixels: the zoom of an oblique one is nearly that
-            assert torch.allclose(expected.lens.sensitivity, result.lens.sensitivity, rtol=0.1, atol=20.0)
     for a, b in pairs:
         assert torch.allclose(a, b, rtol=1e-9, atol=1e-8)
     assert torch.equal(result.view, expected.view)

@@ -84,7 +84,7 @@ def coloured(pixels: np.ndarray) -> float:
 def test_a_measurement_shows_its_views(measurement: Measurement):
     shown = Panel(measurement._repr_html_())
     cells = " | ".join(shown.cells)
-    for words in ("Views | 5, 26 × 20 px", "Displacement | rms", "Noise σ | rms", "24 × 20 × 16 mm", "1.00027"):
+    for words in ("Views | 5, 28 × 22 px", "Displacement | rms", "Noise σ | rms", "24 × 20 × 16 mm", "1.00027"):
         assert words in cells
     assert coloured(shown.pixels) > 0.02
     still = replace(measurement, displacement=torch.zeros_like(measurement.displacement))

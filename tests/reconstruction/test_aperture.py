@@ -16,13 +16,12 @@ from nerif.cli.cli import main
 from nerif.data.measurement import Measurement
 from nerif.data.volume_file import read_volume
 from nerif.fields.network import NetworkShape
-from nerif.fields.phantoms import Scaled, make_phantom
+from nerif.fields.phantoms import make_phantom
 from nerif.forward.images import Images
 from nerif.forward.path_integral import PathIntegral, project
-from nerif.forward.registry import TECHNIQUES, forward_model
+from nerif.forward.registry import forward_model
 from nerif.geometry import Box, Grid, Lens, Ring
-from nerif.reconstruction.aperture import apply_aperture, lens_rays, over_pixels
-from nerif.reconstruction.neural.bins import binned_rays
+from nerif.reconstruction.aperture import apply_aperture, lens_rays
 from nerif.reconstruction.neural.losses import LossWeights, MixedPrecision
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.neural.objective import Objective
@@ -142,77 +141,6 @@ def test_the_operator_agrees_with_the_path_integral(wide):
     assert rays_through(rays, 1e-3) == 16
     assert rays_through(replace(rays, lens=None), 1.0) == 1
     assert operator.for_rays(rays[:10], model).range_shape == (10, 2)
-
-
-def of_areas(measurement: Measurement, diameter: float = 0.0) -> Measurement:
-    lens = Lens(diameter, area=1.0)
-    return replace(measurement, cameras=tuple(replace(c, lens=lens) for c in measurement.cameras))
-
-
-@pytest.mark.parametrize("compiled", [True, False])
-@pytest.mark.parametrize("technique", ["deflection", "absorption"])
-def test_a_pixel_that_voxels_resolve_is_the_mean_over_its_area(technique, compiled):
-    """Its operator is that of a camera with more pixels, averaged; the adjoint is exact."""
-    kind, cameras = TECHNIQUES[technique], RING.cameras()
-    cameras = tuple(cameras if kind.background else (c.without_background for c in cameras))
-    field = flame() if technique == "deflection" else Scaled(flame(), -100.0)
-    m = of_areas(simulate(field, cameras, BOX, 1.00027, 0.02, 1, 20, techniques=[kind]))
-    (rays, values, _), grid, model = m.rays(), Grid.of_resolution(BOX, 32), forward_model(kind, m)
-    each = rays_through(rays, min(grid.spacing))
-    assert each == 4  # pixels of about 3.5 mm
-    operator = VoxelOperator(rays, grid, model, "cubic", dtype=torch.float64)
-    operator.compiled = compiled
-    x, y = torch.rand(grid.shape, dtype=torch.float64), torch.rand(values.shape, dtype=torch.float64)
-    assert float((operator(x) * y).sum()) == pytest.approx(float((x * operator.T(y)).sum()), rel=1e-6)
-    view = rays.view == 0
-    offsets = torch.cartesian_prod(*[torch.tensor([-0.25, 0.25])] * 2)
-    pixels = (rays.pixel[view][:, None] + offsets).reshape(-1, 2)
-    thin = replace(m.cameras[0], lens=None).rays(pixels.double()).clip(BOX)
-    smooth = make_phantom("gaussians", BOX, 1).sample(grid).double()
-    lines = VoxelOperator(thin, grid, model, "cubic", dtype=torch.float64)(smooth)
-    mean = lines.reshape(-1, 4, values.shape[1]).mean(dim=1)
-    found = operator(smooth)[view]
-    assert float((found - mean).norm() / mean.norm()) < 2e-3
-    single = VoxelOperator(rays[view], Grid.of_resolution(BOX, 12), model, "cubic")
-    assert single.shares is None  # coarse voxels: thin rays
-
-
-def test_areas_count_where_voxels_are_smaller_and_no_window_contains_them(wide):
-    thin, fine, coarse = apply_aperture(wide, "off"), Grid.of_resolution(BOX, 40), Grid.of_resolution(BOX, 14)
-    assert over_pixels(thin, coarse) is thin
-    assert all(camera.lens.area == 1 for camera in over_pixels(thin, fine).cameras)
-    assert {(c.lens.diameter, c.lens.area) for c in over_pixels(wide, fine).cameras} == {(12.5, 1.0)}
-    windows = replace(wide, cameras=tuple(replace(c, lens=Lens(window=3.0)) for c in wide.cameras))
-    assert over_pixels(windows, fine) is windows
-    flat = Box((-25.0, -25.0, -2.5), (25.0, 25.0, 2.5))
-    slice_ = replace(thin, box=flat)
-    assert over_pixels(slice_, Grid.of_resolution(flat, 40)) is slice_
-    rays = of_areas(thin).rays()[0]
-    cone = of_areas(thin, 12.5).rays()[0]
-    assert [rays_through(rays, length) for length in (10.0, 2.0, 1.0)] == [1, 4, 9]
-    assert rays_through(cone, 1.0) == 16
-    bins, _, _ = binned_rays(of_areas(thin), thin.observations[0], 2)
-    assert float(bins.lens.window.max()) == 1.0
-    memory = [Tikhonov(voxels=40).operator_bytes(m, fine) for m in (thin, over_pixels(thin, fine))]
-    assert memory[0] == memory[1] > Tikhonov(voxels=40).operator_bytes(windows, coarse)
-
-
-def test_the_error_does_not_rise_with_the_voxels():
-    """With a line of sight per pixel, steps at these lines alone explain the data, and the field is too flat."""
-    ring = Ring(views=4, arc=(0.0, 135.0), image_size=(8, 10), pixel_pitch=0.45)
-    pixels = [replace(camera, lens=Lens(window=1.0, points=9)) for camera in ring.cameras()]
-    truth = make_phantom("gaussians", BOX, 2)
-    m = apply_aperture(simulate(truth, pixels, BOX, 1.00027, 0.02), "off")
-    grid = Grid.of_resolution(BOX, 24)
-    exact, settings = truth.sample(grid), {"regularisation": 0.002, "iterations": 20, "coarse_to_fine": False}
-    errors, fields = [], []
-    for voxels in (10, 24):
-        fields.append(TotalVariation(voxels=voxels, device="cpu", **settings)(m).field)
-        errors.append(float((fields[-1].sample(grid) - exact).norm() / exact.norm()))
-    assert errors[1] < 1.05 * errors[0]
-    # the residual of a re-projection is that of the reconstruction
-    residual = [(reproject(f, m).predicted - m.displacement)[m.sees_box].square().mean().sqrt() for f in fields]
-    assert float(residual[1]) < 1.2 * float(residual[0])
 
 
 def test_the_aperture_can_be_off_or_required(wide):

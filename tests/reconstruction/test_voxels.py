@@ -12,7 +12,7 @@ from safetensors import SafetensorError
 from nerif.analysis.evaluation import evaluate_views, evaluate_volume, reproject
 from nerif.data.volume import Volume
 from nerif.fields.grid import VoxelField
-from nerif.geometry import Grid
+from nerif.geometry import Grid, Lens
 from nerif.reconstruction.base import Reconstruction, State, Step
 from nerif.reconstruction.files import CHECKPOINT, read_field, read_state, write_field, write_state
 from nerif.reconstruction.gauge import visual_hull
@@ -208,6 +208,17 @@ def test_progress_rises_to_the_end(measurement):
     assert progress == sorted(progress)
 
 
+@pytest.mark.parametrize(("window", "expected"), [(0.0, 24), (3.0, 40)])
+def test_voxels_are_not_smaller_than_pixels_resolve_unless_windows_overlap(measurement, window, expected):
+    """In smaller ones, steps between the lines of sight would explain the data: the error rose with the voxels."""
+    cameras = tuple(replace(camera, lens=Lens(window=window)) for camera in measurement.cameras)
+    settings, note = Tikhonov(voxels=40).resolved(replace(measurement, cameras=cameras))
+    assert settings.voxels == expected
+    assert ("24 voxels" in note) == (expected == 24)
+    within = Tikhonov(voxels=20)
+    assert within.resolved(measurement) == (within, "")
+
+
 # -- invalid input -------------------------------------------------------------------------------------------------
 
 
@@ -237,7 +248,7 @@ def test_invalid_data(fixed, measurement, monkeypatch):
     with refused("open_faces"):
         replace(FIXED, open_faces=("x-", "x+", "y-", "y+", "z-", "z+"))(measurement)
     with refused("resume"):
-        replace(FIXED, voxels=30)(measurement, resume=fixed.state)
+        replace(FIXED, voxels=20)(measurement, resume=fixed.state)
     monkeypatch.setattr(descent, "available_memory", lambda device: 1 << 16)
     with refused("voxels"):
         FIXED(measurement)

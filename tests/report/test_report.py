@@ -344,7 +344,7 @@ def test_of_many_pixels_a_regular_lattice_is_used(measurement, nothing):
 
 def test_images_shrink_along_each_edge(nothing, monkeypatch):
     assert {v.bin_size for v in view_images(nothing, [])[0]} == {(1, 1)}
-    monkeypatch.setattr("nerif.report.view_images.MAX_PAGE_PIXELS", 6 * 5 * 13**2)
+    monkeypatch.setattr("nerif.report.view_images.MAX_PAGE_PIXELS", 6 * 5 * 14**2)
     assert {v.bin_size for v in view_images(nothing, [])[0]} == {(2, 2)}
     assert _shrink(np.ones((2, 900)), (1, 3)).shape == (2, 300)
     image = np.arange(24.0).reshape(4, 6)

@@ -26,7 +26,6 @@ from nerif.forward.path_integral import LENS_RAYS, FieldProjector, PathIntegral,
 from nerif.forward.ray_tracing import CurvedRays
 from nerif.forward.registry import ASSUMED, AUTO, TECHNIQUES, check_simulated, forward_model, forward_models
 from nerif.geometry import Box, Camera, Grid, Rays
-from nerif.reconstruction.aperture import over_pixels
 from nerif.reconstruction.device import on_free_cores
 from nerif.reconstruction.voxels.operator import rays_through
 from nerif.reconstruction.voxels.symmetric_operator import project_spline
@@ -165,7 +164,6 @@ def reproject(
     network, *splines = field.parts if isinstance(field, SumField) else (field,)
     large = isinstance(network, NeuralField) and not _is_exact(network.network, _points(measurement.cameras), device)
     voxels = on_voxels(network, box, device) if large else None
-    cameras = over_pixels(measurement, field.grid).cameras if isinstance(field, Splines) else measurement.cameras
     total = sum(len(_views_of(kind, measurement.cameras)) for kind in measurement.techniques)
     for observation in measurement.observations:
         kind = observation.technique
@@ -174,7 +172,7 @@ def reproject(
         projector = PathIntegral(integral, _samples(field))
         sampled = None if voxels is None else SampledViews(field, (voxels, *splines), box, projector, device)
         predicted = torch.full_like(observation.values, float("nan"))
-        views = [(i, kind.seen_by(cameras[i])) for i in _views_of(kind, cameras)]
+        views = [(i, kind.seen_by(measurement.cameras[i])) for i in _views_of(kind, measurement.cameras)]
         for i, camera in views:
             height, width = camera.image_size
             if (integral, i) not in integrals and sampled:

@@ -318,7 +318,7 @@ class Camera:
         zero = torch.zeros_like(pixels[..., 0])
         number = torch.full(zero.shape, view, dtype=torch.int16)
         ends = self._background_points(origin, direction, sensitivity)
-        lens = self._lens_discs(origin, direction, ends)
+        lens = self._lens_discs(direction, ends)
         begin = torch.full_like(zero, self.projection.begin)
         return Rays(origin, direction, zero, zero, pixels, number, begin, ends, lens)
 
@@ -356,7 +356,7 @@ class Camera:
         """The camera whose pixels measure at a point, not the mean over a window."""
         return self if self.lens is None else replace(self, lens=replace(self.lens, window=0.0))
 
-    def _lens_discs(self, origin: Points, direction: Points, ends: BackgroundPoints | None) -> LensDiscs | None:
+    def _lens_discs(self, direction: Points, ends: BackgroundPoints | None) -> LensDiscs | None:
         if self.lens is None:
             return None
         axis = self.rotation[2].to(direction)
@@ -368,13 +368,9 @@ class Camera:
             focus = torch.full_like(direction[..., 0], torch.inf)
         normal = axis if self.background is None else self.background.normal.to(direction)
         radius = torch.full_like(focus, self.lens.diameter / 2)
-        raster, near = self.lens.area > self.lens.window, None
-        window = torch.full_like(focus, max(self.lens.area, self.lens.window) / 2)
+        window = torch.full_like(focus, self.lens.window / 2)
         parallel = torch.full_like(focus, not self.projection.shows_depth, dtype=torch.bool)
-        if raster and ends is None:
-            near = -self._project_jacobian(origin + direction)[1]
-        discs = axis.expand_as(direction), normal.expand_as(direction), radius, focus, window, parallel
-        return LensDiscs(*discs, near, raster)
+        return LensDiscs(axis.expand_as(direction), normal.expand_as(direction), radius, focus, window, parallel)
 
     def _background_points(self, origin: Points, direction: Points, sensitivity: bool) -> BackgroundPoints | None:
         if self.background is None:

@@ -1,4 +1,4 @@
-"""The ray bundle of a pixel: rays from the lens aperture that meet in the plane in focus, over its area or a window.
+"""The ray bundle of a pixel: rays from the lens aperture that meet in the plane in focus, over a window of pixels.
 
 L = O + r (x e_1 + y e_2),  |(x, y)| <= 1        a point of the aperture about the camera's centre O, radius r
 X_f = O + s_f t                                  in focus on the pixel's own ray, O + s t
@@ -58,7 +58,7 @@ PLASTIC = 1.324717957244746  # root of x^3 = x + 1, which gives the most even la
 
 @dataclass(frozen=True)
 class Lens:
-    """The aperture and window of a pixel: a thin lens, and the square of pixels over which its value is the mean.
+    """The aperture and window of a pixel: a thin lens, and the square of pixels over which a displacement is the mean.
 
     Parameters
     ----------
@@ -67,15 +67,13 @@ class Lens:
     focus : depth of the plane in focus along the optical axis, mm, negative only for a telecentric lens; None: the
         background
     points : number of points on the disc for rendered images and simulated measurements
-    window : edge of the square of a displacement, px; 0 for a displacement at the pixel
-    area : edge of the pixel itself, px, where voxels are smaller; 0 for a value at a point
+    window : edge of the square, px; 0 for a displacement at the pixel
     """
 
     diameter: float = 0.0
     focus: float | None = None
     points: Count = 19
     window: Annotated[float, Ge(0), Le(MAX_WINDOW)] = 0.0
-    area: Annotated[float, Ge(0), Le(MAX_WINDOW)] = 0.0
 
     def __post_init__(self) -> None:
         check_settings(self)
@@ -86,7 +84,7 @@ class Lens:
 
     @property
     def wide(self) -> bool:
-        """Whether a pixel measures through more than one thin ray."""
+        """Whether a pixel has more than one thin ray."""
         return self.diameter > 0 or self.window > 0
 
     def offsets(self) -> Float[Tensor, "n 4"]:
@@ -101,7 +99,7 @@ class Lens:
 
 @dataclass(frozen=True)
 class LensDiscs(Columns):
-    """The disc of the lens about each ray, and the window about its pixel, or its area.
+    """The disc of the lens about each ray, and the window about its pixel.
 
     Parameters
     ----------
@@ -111,8 +109,6 @@ class LensDiscs(Columns):
     focus : (n,) path length from the ray's origin to the point in focus, mm
     window : (n,) half the edge of the window, px
     parallel : (n,) whether rays of other pixels are parallel to this one, or have the same origin
-    sensitivity : (n, 2, 3) of a camera without background: that of a plane 1 mm along the ray, for its window; or None
-    raster : whether the window is the pixel's own area, whose rays form one raster with those of its neighbours
     box : to which rays through other points of the disc are clipped, or None
     """
 
@@ -122,8 +118,6 @@ class LensDiscs(Columns):
     focus: Float[Tensor, " n"]
     window: Float[Tensor, " n"]
     parallel: Bool[Tensor, " n"]
-    sensitivity: Float[Tensor, "n 2 3"] | None = None
-    raster: bool = False
     box: Box | None = None
 
     def shifts(
@@ -157,26 +151,18 @@ class LensDiscs(Columns):
         return x[..., None] * first[:, None] + y[..., None] * second[:, None]
 
 
-def spread_points(
-    rays: int, count: int, generator: torch.Generator | None = None, raster: int = 0
-) -> Float[Tensor, "n k 4"]:
+def spread_points(rays: int, count: int, generator: torch.Generator | None = None) -> Float[Tensor, "n k 4"]:
     """Return points of the unit disc and of the square [-1, 1]^2 for each ray, evenly over both.
 
     Parameters
     ----------
-    count : even, or 1 for the middle; with a raster a multiple of its points, even unless the disc is a point
+    count : even, or 1 for the middle
     generator : of a random rotation and shift; None: the same points in each call
-    raster : points along an edge of the square, in the middle of equal parts; 0: those of `_square`
     """
     if count == 1:
         return torch.zeros(rays, 1, 4)
     generator = generator or torch.Generator().manual_seed(SEED)
-    disc = _disc(rays, count, generator) if count % 2 == 0 else torch.zeros(rays, count, 2)
-    if raster:
-        row = (2 * torch.arange(raster) + 1) / raster - 1
-        order = torch.arange(count) * (raster + 1) % raster**2  # neighbours on the disc are not neighbours in it
-        square = torch.cartesian_prod(row, row)[order]
-        return torch.cat([disc, square.expand(rays, -1, -1)], dim=-1)
+    disc = _disc(rays, count, generator)
     return torch.cat([disc, _square(torch.rand(rays, 1, 2, generator=generator), count)], dim=-1)
 
 

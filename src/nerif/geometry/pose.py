@@ -77,23 +77,19 @@ class Corrections:
         narrowed = narrow(rays.direction)
         direction = turn(narrowed / narrowed.norm(dim=-1, keepdim=True))
         origin = of["new_centre"] + turn(narrow(rays.origin - of["centre"]))
-        def turned(sensitivity: Tensor) -> Tensor:
-            along = (sensitivity * of["axis"][:, None]).sum(-1, keepdim=True) * of["axis"][:, None]
-            zoomed = along + (sensitivity - along) * of["zoom"][:, None, None]
-            return (zoomed[:, :, None] * of["motion"][:, None]).sum(-1)
-
         axis, ends, lens = turn(of["axis"]), rays.background, rays.lens
         if ends is not None:
             distance = (of["offset"] - (origin * of["normal"]).sum(-1)) / (direction * of["normal"]).sum(-1)
             depth = ends.distance * (rays.direction * of["axis"]).sum(-1)
             nearer = torch.where(of["depth"], depth / (distance * (direction * axis).sum(-1)), 1.0)
-            ends = BackgroundPoints(turned(ends.sensitivity) * nearer[:, None, None], distance)
+            along = (ends.sensitivity * of["axis"][:, None]).sum(-1, keepdim=True) * of["axis"][:, None]
+            sensitivity = along + (ends.sensitivity - along) * of["zoom"][:, None, None]
+            sensitivity = (sensitivity[:, :, None] * of["motion"][:, None]).sum(-1) * nearer[:, None, None]
+            ends = BackgroundPoints(sensitivity, distance)
         if lens is not None:
             sharp = of["focus"] / (direction * axis).sum(-1)
             focus = torch.where(of["focus"].isnan(), lens.focus if ends is None else ends.distance, sharp)
-            near = None if lens.sensitivity is None else turned(lens.sensitivity)
-            normal = axis if ends is None else lens.normal
-            lens = replace(lens, axis=axis, focus=focus, normal=normal, sensitivity=near)
+            lens = replace(lens, axis=axis, focus=focus, normal=axis if ends is None else lens.normal)
         return replace(rays, origin=origin, direction=direction, background=ends, lens=lens).clip(box)
 
 

@@ -164,15 +164,14 @@ class Rays(Columns):
         whole = replace(whole, origin=origin, direction=direction.flatten(0, 1), background=ends)
         return whole if self.lens.box is None else whole.clip(self.lens.box)
 
-    def spread(self, each: int, generator: torch.Generator | None = None, raster: int = 0) -> Rays:
+    def spread(self, each: int, generator: torch.Generator | None = None) -> Rays:
         """Return `each` rays per ray, evenly over its lens and its window (`through`).
 
         Parameters
         ----------
         generator : of their places; None: the same places in each call
-        raster : rays along an edge of the window; 0: scattered over it
         """
-        points = spread_points(len(self), each, generator, raster).to(self.near.dtype)
+        points = spread_points(len(self), each, generator).to(self.near.dtype)
         return self.through(sent(points, self.near.device))
 
     def _of_window(
@@ -180,10 +179,9 @@ class Rays(Columns):
     ) -> tuple[Float[Tensor, "n _ 3"], Float[Tensor, "n _ 3"], Float[Tensor, "n _ 1"]]:
         """Starts of the thin rays of other pixels, mm from the origin, their directions and their relative lengths."""
         toward, zero = self.direction[:, None], torch.zeros_like(self.direction[:, None])
-        ends = self._image_of_window
-        if self.lens is None or ends is None or not bool(self.lens.window.any()):
+        if self.lens is None or self.background is None or not bool(self.lens.window.any()):
             return zero, toward, torch.ones_like(toward[..., :1])
-        parallel = self.lens.parallel[:, None, None]
+        ends, parallel = self.background, self.lens.parallel[:, None, None]
         aside = self.lens.shifts(square, ends.sensitivity, self.direction)
         along, length = (aside * toward).sum(-1, keepdim=True), ends.distance[:, None, None]
         end = length * toward + aside
@@ -191,30 +189,16 @@ class Rays(Columns):
         start = torch.where(parallel, aside - along * toward, 0.0)
         return start, torch.where(parallel, toward, end / reach), reach / length
 
-    @property
-    def _image_of_window(self) -> BackgroundPoints | None:
-        """The plane on which other pixels of the window are found: the background, or one near the camera."""
-        if self.background is not None or self.lens is None or self.lens.sensitivity is None:
-            return self.background
-        return BackgroundPoints(self.lens.sensitivity, torch.ones_like(self.near))
-
     def half_width(self, s: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
         """Return half the width (mm) of the ray bundles of pixels at path lengths s, mm."""
         if self.lens is None:
             return torch.zeros_like(s)
-        return torch.hypot(self.half_cone(s), self.half_window(s))
-
-    def half_cone(self, s: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
-        """Return the radius (mm) of the cones of rays to points in focus at path lengths s, mm."""
-        return torch.zeros_like(s) if self.lens is None else (self.lens.radius * (1 - s / self.lens.focus)).abs()
-
-    def half_window(self, s: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
-        """Return half the width (mm) of the windows of pixels alone at path lengths s, mm."""
-        ends = self._image_of_window
-        if self.lens is None or ends is None:
-            return torch.zeros_like(s)
-        share = torch.where(self.lens.parallel, 1.0, s / ends.distance)
-        return self.lens.window / torch.linalg.matrix_norm(ends.sensitivity, 2).clamp_min(1e-12) * share
+        cone = self.lens.radius * (1 - s / self.lens.focus)
+        if self.background is None:
+            return cone.abs()
+        share = torch.where(self.lens.parallel, 1.0, s / self.background.distance)
+        window = self.lens.window / torch.linalg.matrix_norm(self.background.sensitivity, 2).clamp_min(1e-12) * share
+        return torch.hypot(cone, window)
 
     def mean_of(self, each: int, values: Float[Tensor, "m c"]) -> Float[Tensor, "n c"]:
         """Return the mean over each pixel of the values of its `each` consecutive rays (`through`)."""

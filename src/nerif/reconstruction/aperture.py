@@ -1,4 +1,4 @@
-"""Pixels with an aperture, a correlation window or their own area, or as thin rays."""
+"""Pixels with an aperture or a correlation window, or as thin rays."""
 
 from __future__ import annotations
 
@@ -9,11 +9,8 @@ import torch
 
 from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
-from nerif.geometry import Grid, Lens
-from nerif.reconstruction.voxels.levels import pixels_in_a_voxel
-from nerif.reconstruction.voxels.operator import APART
 
-__all__ = ["apply_aperture", "check_aperture", "lens_rays", "over_pixels"]
+__all__ = ["apply_aperture", "check_aperture", "lens_rays"]
 
 APERTURES = ("auto", "on", "off")
 RAYS_PER_PX2, MAX_RAYS = 2, 12  # of a pixel: per square of the cone's radius in px, and at most
@@ -38,22 +35,6 @@ def apply_aperture(measurement: Measurement, aperture: str) -> Measurement:
     if (aperture != "off" and any(lens.wide for lens in lenses)) or not lenses:
         return measurement
     return replace(measurement, cameras=tuple(replace(camera, lens=None) for camera in measurement.cameras))
-
-
-def over_pixels(measurement: Measurement, grid: Grid) -> Measurement:
-    """Return the measurement with pixels that are the mean over their area, if voxels of a grid are smaller.
-
-    Along single lines of sight, steps of the field at these lines alone would explain displacements
-    (docs/decisions/064). A correlation window contains the pixel. A slice, thinner than two pixels or of a single row,
-    has no neighbours across it, and keeps thin rays.
-    """
-    lenses = [camera.lens or Lens() for camera in measurement.cameras]
-    slices = min(min(camera.image_size) for camera in measurement.cameras) == 1
-    slices |= min(measurement.box.edges) < 2 * max(measurement.pixel_sizes)
-    if slices or max(lens.window for lens in lenses) >= 1 or APART * pixels_in_a_voxel(measurement, grid) >= 1:
-        return measurement
-    pairs = zip(measurement.cameras, lenses, strict=True)
-    return replace(measurement, cameras=tuple(replace(c, lens=replace(lens, area=1.0)) for c, lens in pairs))
 
 
 def lens_rays(measurement: Measurement, count: int = 0) -> int:

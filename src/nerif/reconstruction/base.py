@@ -233,6 +233,10 @@ class Reconstructor(ABC):
             `resume` is of another method, other settings or other data.
         """
 
+    def resolved(self, measurement: Measurement) -> tuple[Reconstructor, str]:
+        """Return the settings within what a measurement resolves, and a line on what that changed, or nothing."""
+        return self, ""
+
     @abstractmethod
     def in_two(self) -> tuple[Reconstructor, Reconstructor]:
         """Return settings of a short first run, and of a run that starts from its field within the same limits."""

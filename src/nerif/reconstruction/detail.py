@@ -35,7 +35,7 @@ from nerif.forward.path_integral import PathIntegral, project
 from nerif.forward.registry import AUTO, forward_models
 from nerif.geometry import Grid
 from nerif.geometry.symmetry import Axis
-from nerif.reconstruction.aperture import apply_aperture, over_pixels
+from nerif.reconstruction.aperture import apply_aperture
 from nerif.reconstruction.bounds import field_bounds
 from nerif.reconstruction.device import resolve_device
 from nerif.reconstruction.gauge import with_gauge
@@ -43,14 +43,13 @@ from nerif.reconstruction.shared_settings import SharedSettings
 from nerif.reconstruction.sources import of_source
 from nerif.reconstruction.target import Target
 from nerif.reconstruction.voxels.layout import layout_of
-from nerif.reconstruction.voxels.levels import bins_of, pixels_in_a_voxel
+from nerif.reconstruction.voxels.levels import bins_of, resolved_voxels
 from nerif.reconstruction.voxels.prior import Prior, WhiteProblem, von_karman
 from nerif.reconstruction.voxels.problem import Iterate, Problem
 from nerif.reconstruction.voxels.total_variation import gradient_square
 
 __all__ = ["Choice", "Detail", "Posterior", "check_sigma", "choose"]
 
-VOXEL = 0.7  # px: edge of a voxel in the middle of the box
 MOST_VOXELS = 160  # along the longest edge of the box
 COARSE = 2  # fine voxels, and pixels, in a coarse one
 OUTER_SCALE = 0.1  # L; this and the widths are shares of the longest edge of the box
@@ -169,8 +168,6 @@ class Detail:
         self.layout = layout_of(self.measurement, axis, device=resolve_device(settings.device))
         self.device = self.layout.device
         fine = self.layout.grid(voxels or voxels_of(self.measurement))
-        if voxels is not None:
-            self.measurement = over_pixels(self.measurement, fine)
         self.bins = coarse * bins_of(self.measurement, fine, voxels=1.0)
         self.grid = self.layout.grid(max(1, max(fine.shape) // coarse))
 
@@ -402,5 +399,4 @@ def check_sigma(measurement: Measurement) -> None:
 
 def voxels_of(measurement: Measurement) -> int:
     """Return the voxels along the longest edge of the box that are somewhat smaller than the pixels, at most MOST."""
-    pixels = pixels_in_a_voxel(measurement, Grid.of_resolution(measurement.box, MOST_VOXELS)) * MOST_VOXELS
-    return max(COARSE * 8, min(MOST_VOXELS, round(pixels / VOXEL)))
+    return max(COARSE * 8, min(MOST_VOXELS, resolved_voxels(measurement)))

@@ -20,7 +20,7 @@ from nerif.fields.base import Field
 from nerif.fields.grid import spline_coefficients
 from nerif.forward.registry import AUTO
 from nerif.geometry import Grid
-from nerif.reconstruction.aperture import apply_aperture, over_pixels
+from nerif.reconstruction.aperture import apply_aperture
 from nerif.reconstruction.device import resolve_device
 from nerif.reconstruction.gauge import ambient_faces as faces_of
 from nerif.reconstruction.sources import of_source
@@ -57,8 +57,7 @@ class Projector:
     open_faces : faces through which flow leaves the box; pixels whose rays cross them have no data
     model : a linear forward model by name, or auto
     source : of displacements and images, the data: displacements, images, both, or auto (displacements)
-    aperture : auto (with the lenses of the measurement, and the area of pixels that are wider than voxels), on, or off
-        (thin rays)
+    aperture : auto (with the lenses of the measurement), on, or off (thin rays)
     device, dtype : of x and y; inputs are converted
 
     Raises
@@ -76,8 +75,6 @@ class Projector:
         measurement = apply_aperture(of_source(measurement, source, preferred="displacements"), aperture)
         measurement = replace(measurement, box=grid.box, ambient_region=None)
         self.measurement, self.grid, self.dtype = measurement, grid, dtype
-        if aperture != "off":
-            measurement = over_pixels(measurement, grid)
         self.device = resolve_device(str(device))
         faces = faces_of(measurement) if ambient_faces is None else ambient_faces
         self.layout = InSpace(box=grid.box, faces=faces, basis=basis, device=self.device, dtype=dtype)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
@@ -15,11 +16,12 @@ from nerif.analysis.gains import fit_gains, with_gains
 from nerif.analysis.prediction import check_sees
 from nerif.common.conventions import InputError
 from nerif.common.installation import command_line, word_of
+from nerif.common.memory import free_memory
 from nerif.common.settings import NonNegative, check_settings
 from nerif.data.measurement import Measurement
 from nerif.data.volume import Volume, quantities_of
 from nerif.fields.base import Field
-from nerif.geometry import Box
+from nerif.geometry import Box, Grid
 from nerif.physics.quantities import GasSettings
 from nerif.reconstruction.aperture import apply_aperture
 from nerif.reconstruction.base import VOXELS, OnStep, Reconstruction, Reconstructor, State, Step
@@ -42,6 +44,8 @@ from nerif.workflow.budget import Budget
 from nerif.workflow.cross_validation import AUTO, MIN_VIEWS, CrossValidation, with_halves
 
 __all__ = ["Inputs", "Job", "Run", "remedy"]
+
+VOLUMES = 4  # written quantities, in double precision while they are derived
 
 
 @dataclass(frozen=True)
@@ -101,6 +105,7 @@ class Inputs:
     gains : intensity gains by view
     path : of the measurement; None for one in memory
     box : of the result; that of the data may be larger (grow)
+    note : line on a setting that the data limit, if one is
     """
 
     all_views: Measurement
@@ -110,12 +115,13 @@ class Inputs:
     gains: dict[str, float]
     path: Path | None
     box: Box
+    note: str = ""
 
     @classmethod
     def of(
         cls, measurement: Measurement | str | os.PathLike[str], reconstructor: Reconstructor, run: Run
     ) -> tuple[Inputs, Reconstructor]:
-        """Read and split the data; return them with the settings, to which a symmetric flow adds its axis."""
+        """Read and split the data; return them with settings for them: voxels no smaller, the axis of the flow."""
         path = None if isinstance(measurement, Measurement) else Path(measurement)
         if not isinstance(measurement, Measurement):
             measurement = Measurement.read(measurement)
@@ -129,12 +135,13 @@ class Inputs:
         gains = fit_gains(training) if run.fit_gains else {}
         if gains:
             measurement, training = with_gains(measurement, gains), with_gains(training, gains)
-        return cls(all_views, measurement, training, withheld, gains, path, box), reconstructor
+        reconstructor, note = reconstructor.resolved(training)
+        return cls(all_views, measurement, training, withheld, gains, path, box, note), reconstructor
 
     @property
     def remarks(self) -> list[str]:
-        """Lines on intensity gains and on pixels that are left out."""
-        lines = []
+        """Lines on changed settings, intensity gains and pixels that are left out."""
+        lines = [self.note] if self.note else []
         if self.gains:
             lines.append("intensity gains: " + ", ".join(f"{name} {gain:.4f}" for name, gain in self.gains.items()))
         if self.measurement.bad_pixels:
@@ -162,6 +169,17 @@ def grown(measurement: Measurement, reconstructor: Reconstructor, length: float)
     ambient = tuple(face for face in measurement.ambient_faces if face not in faces)
     measurement = replace(measurement, box=box, ambient_faces=ambient)
     return measurement, replace(reconstructor, **changes)  # type: ignore[type-var]
+
+
+def check_written(grid: Grid) -> None:
+    """Refuse a grid whose volumes do not fit into the memory."""
+    required = VOLUMES * 8 * math.prod(grid.shape)
+    if required > (free := free_memory()):
+        raise InputError(
+            f"volumes of {' x '.join(map(str, grid.shape))} need {required / 2**30:.1f} GiB, {free / 2**30:.1f} GiB "
+            "are free; give fewer --voxels",
+            field="voxels",
+        )
 
 
 class Job:
@@ -197,8 +215,7 @@ class Job:
         self.inputs, self.reconstructor = Inputs.of(measurement, reconstructor, run)
         if voxels is None:
             voxels = getattr(self.stated, "voxels", VOXELS)
-        if voxels < 1:
-            raise InputError(f"expected 1 or more, got {voxels}", field="voxels")
+        check_written(Grid.of_resolution(self.inputs.box, voxels))
         self.voxels, self.trials = voxels, Trials(run.uncertainty)
         self.budget = Budget.of(self.reconstructor, self.inputs.training, voxels, since)
         self.run = replace(run, gas=run.gas.for_measurement(self.inputs.measurement))
@@ -288,9 +305,8 @@ class Job:
         """Return the settings that repeat the run, by the names of the options."""
         run, reconstructor, path = self.run, self.reconstructor, self.inputs.path
         settings: dict[str, Any] = {**keep, **asdict(run), **asdict(reconstructor)}  # type: ignore[call-overload]
-        if run.grow:
-            stated = asdict(self.stated)  # type: ignore[call-overload]
-            settings |= {name: stated[name] for name in ("open_faces", "voxels") if name in stated}
+        stated = asdict(self.stated)  # type: ignore[call-overload]
+        settings |= {name: stated[name] for name in ("open_faces", "voxels") if name in stated}
         if run.start_from is not None:
             settings["start_from"] = run.start_from.resolve()
         if "density" not in quantities_of(self.measurement.quantity):

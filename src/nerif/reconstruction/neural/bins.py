@@ -58,8 +58,6 @@ def binned_rays(
         d = torch.where(mask[..., None], observation.values[i, :height, :width], 0.0)
         total = _sums(weight, view_edge)
         mean = total.mean(-1, keepdim=True)
-        if camera.lens is not None:
-            camera = replace(camera, lens=replace(camera.lens, area=view_edge * camera.lens.area))
         moment = _sums(weight.mean(-1, keepdim=True) * camera.pixel_grid(), view_edge)
         keep = (mean[..., 0] > 0) & (keep if view_edge == edge else True)
         pixels = (moment / mean)[keep].to(camera.intrinsics.dtype)

@@ -28,7 +28,7 @@ from nerif.common.pauses import pause
 from nerif.data.measurement import Measurement
 from nerif.fields.base import Field
 from nerif.geometry import Grid
-from nerif.reconstruction.aperture import apply_aperture, over_pixels
+from nerif.reconstruction.aperture import apply_aperture
 from nerif.reconstruction.base import OnStep, Outcome, Reconstruction, State, Step
 from nerif.reconstruction.bounds import field_bounds
 from nerif.reconstruction.device import Cores, available_memory, peak_memory, resolve_device
@@ -78,6 +78,7 @@ class Descent:
     ) -> None:  # fmt: skip
         measurement = of_source(measurement, settings.source, preferred="displacements")
         measurement = with_gauge(apply_aperture(measurement, settings.aperture), settings)
+        settings, _ = settings.resolved(measurement)
         self.settings, self.measurement, self.on_step, self.start = settings, measurement, on_step, start
         check_gauge(measurement, bool(settings.probes), settings.hull)
         self.axis = axis_of(settings, measurement)
@@ -89,8 +90,6 @@ class Descent:
         grids = self.layout.grids(settings.voxels, settings.coarse_to_fine)
         self.levels = levels(measurement, grids, settings.coarse_to_fine)
         finest = grids[-1]
-        self.fingerprint = fingerprint(measurement, settings.open_faces, settings.refine)
-        self.measurement = measurement = over_pixels(measurement, finest)
         self._check_memory(finest.shape, settings.memory_bytes(measurement, finest, self.device.type))
         self.free = self.layout.free(measurement, finest, settings.hull)
         bounds = field_bounds(measurement, settings.lower, settings.upper)
@@ -115,6 +114,7 @@ class Descent:
         self.checkpoint: State
         self.ended: Outcome | None = None  # of the run that is resumed
         self.earlier_seconds, self.begin_time = 0.0, time.perf_counter()
+        self.fingerprint = fingerprint(measurement, settings.open_faces, settings.refine)
         if resume is not None:
             self._restore(resume)
 

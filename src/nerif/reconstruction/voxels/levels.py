@@ -13,8 +13,9 @@ from torch import Tensor
 from nerif.data.measurement import Measurement
 from nerif.geometry import Grid
 
-__all__ = ["FINE_BIN", "Level", "bins_of", "coarser", "levels", "pixels_in_a_voxel"]
+__all__ = ["FINE_BIN", "Level", "bins_of", "coarser", "levels", "pixels_in_a_voxel", "resolved_voxels"]
 
+SMALLEST = 0.7  # px: in smaller voxels, steps at the lines of sight alone would explain the data (docs/decisions/064)
 COARSE_BIN = 1.25  # voxels: edge of bins before the last level
 FINE_BIN = 0.25  # voxels: bins this small blur nothing that the grid can resolve
 
@@ -52,6 +53,11 @@ def pixels_in_a_voxel(measurement: Measurement, grid: Grid) -> float:
         spans = (pixels[1:] - pixels[0]).norm(dim=-1).nan_to_num(1.0).clamp(max=min(camera.image_size))
         largest.append(float(spans.max()))  # of the edge nearest to the image plane
     return min(largest)
+
+
+def resolved_voxels(measurement: Measurement) -> int:
+    """Return the voxels along the longest edge of the box that are SMALLEST of the widest pixels, at least 8."""
+    return max(8, round(max(measurement.box.edges) / (SMALLEST * max(measurement.pixel_sizes))))
 
 
 def coarser(free: Bool[Tensor, "z y x"], grid: Grid) -> Bool[Tensor, "Z Y X"]:

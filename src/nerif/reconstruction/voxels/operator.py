@@ -23,7 +23,6 @@ __all__ = ["VoxelOperator", "apply_rows", "check_step", "operator_norm", "rays_t
 MAX_STEP = {"linear": 0.5, "cubic": 1.0}
 # of rays through a lens, per voxel of the cone's radius in the middle of the box; of a pixel
 PAIRS_PER_VOXEL, MAX_PAIRS = 2.0, 8
-APART = 1.35  # voxels between neighbouring lines of sight, at most (docs/decisions/064)
 
 
 class VoxelOperator:
@@ -33,7 +32,7 @@ class VoxelOperator:
 
     Profile w, A and B are the model's (forward/base.py); samples lie where rays cross evenly spaced planes (planes.py).
     `A(c)` applies the operator, `A.T(y)` its exact adjoint: on a CPU by Numba on all cores, on CUDA in PyTorch. A pixel
-    with a lens is the mean over thin rays, the more the wider its cone, and a pixel wider than voxels over a raster.
+    with a lens is the mean over thin rays, the more the wider its cone.
 
     Parameters
     ----------
@@ -74,9 +73,9 @@ class VoxelOperator:
         self.range_shape = (len(rays), len(model.channels))
         self.padded_shape = [n + 2 * self.layers * (axis in self.padded_axes) for axis, n in enumerate(grid.shape)]
         self.shares: Tensor | None = None  # (pixel, ray, 1) weights of rays through a lens
-        each = rays_through(rays, min(grid.spacing))
-        if each > 1:
-            rays = rays.spread(each, raster=_raster(rays, min(grid.spacing)))
+        if rays.lens is not None:
+            each = rays_through(rays, min(grid.spacing))
+            rays = rays.spread(each)
             self.shares = rays.shares(each).reshape(-1, each, 1).to(self.device, dtype)
         self._place_samples(rays, model)
 
@@ -170,34 +169,16 @@ class VoxelOperator:
 
 
 def rays_through(rays: Rays, length: float) -> int:
-    """Return how many rays of a pixel average a field that varies over a length (mm); 1 if thin."""
+    """Return how many rays through the lens of a pixel average a field that varies over a length (mm); 1 if thin."""
     if rays.lens is None:
         return 1
-    points = _raster(rays, length) ** 2
     rays = rays[rays.crosses]
     assert rays.lens is not None
     if not len(rays):
-        return max(2, points)
+        return 2
     middle = 0.5 * (rays.near + rays.far)
-    if not rays.lens.raster:
-        spread = float(rays.half_width(middle).max())
-    elif bool(rays.lens.radius.any()):
-        spread = float(rays.half_cone(middle).max())
-    else:
-        return max(1, points)
-    through = 2 * min(MAX_PAIRS, max(1, math.ceil(PAIRS_PER_VOXEL * spread / length)))
-    return through if points <= 1 else points * math.ceil(through / points)
-
-
-def _raster(rays: Rays, length: float) -> int:
-    """Return the rays along an edge of a pixel with an area, by the view of the widest pixels; 0 without one."""
-    if rays.lens is None or not rays.lens.raster:
-        return 0
-    on_disc, rays = bool(rays.lens.radius.any()), rays[rays.crosses]
-    width = 2 * rays.half_window(0.5 * (rays.near + rays.far))
-    widest = max((float(width[rays.view == view].mean()) for view in rays.view.unique()), default=0.0)
-    points = max(1, math.ceil(widest / (APART * length)))
-    return points + points % 2 if points > 1 and on_disc else points  # points on a disc are even in number
+    spread = float(rays.half_width(middle).max())
+    return 2 * min(MAX_PAIRS, max(1, math.ceil(PAIRS_PER_VOXEL * spread / length)))
 
 
 def check_step(step: float, basis: str) -> None:

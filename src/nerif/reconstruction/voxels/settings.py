@@ -20,12 +20,11 @@ from nerif.data.measurement import Measurement
 from nerif.fields.base import Field
 from nerif.forward.registry import AUTO, MODEL_NAMES
 from nerif.geometry import Grid
-from nerif.reconstruction.aperture import over_pixels
 from nerif.reconstruction.base import OnStep, Reconstruction, State
 from nerif.reconstruction.shared_settings import SHORT_RUN, SharedSettings, Source
 from nerif.reconstruction.voxels import kernels_torch
 from nerif.reconstruction.voxels.descent import Descent
-from nerif.reconstruction.voxels.levels import FINE_BIN, bins_of
+from nerif.reconstruction.voxels.levels import FINE_BIN, SMALLEST, bins_of, resolved_voxels
 from nerif.reconstruction.voxels.operator import VoxelOperator, check_step, rays_through
 from nerif.reconstruction.voxels.problem import Iterate, Problem
 
@@ -45,7 +44,8 @@ class VoxelReconstructor(SharedSettings):
     coarse: ClassVar[float] = 100
     """Times the tolerance, for solutions that are only a start."""
     voxels: Count = 64
-    """Voxels along the longest edge of the box, in the reconstruction and in the written volume."""
+    """Voxels along the longest edge of the box, in the reconstruction, where they are not smaller than 0.7 of a pixel,
+    and in the written volume."""
     basis: Literal["linear", "cubic"] = "cubic"
     """Interpolation between voxel centres: cubic B-splines, or trilinear (less accurate, slightly faster)."""
     model: Literal[*MODEL_NAMES] = AUTO  # type: ignore[valid-type]
@@ -74,6 +74,16 @@ class VoxelReconstructor(SharedSettings):
     def in_two(self) -> tuple[VoxelReconstructor, VoxelReconstructor]:
         voxels = max(min(MIN_VOXELS, self.voxels), self.voxels // 2)
         return replace(self, voxels=voxels, time_limit=SHORT_RUN * self.time_limit), self
+
+    def resolved(self, measurement: Measurement) -> tuple[VoxelReconstructor, str]:
+        most = resolved_voxels(measurement)
+        overlap = all(camera.lens is not None and camera.lens.window >= 1 for camera in measurement.cameras)
+        if self.voxels <= most or overlap:
+            return self, ""
+        return replace(self, voxels=most), (
+            f"solved on {most} voxels along the longest edge instead of {self.voxels}: voxels below {SMALLEST:g} of a "
+            "pixel would have steps between the lines of sight (docs/pixels.md)"
+        )
 
     @property
     def weight(self) -> float | None:
@@ -152,7 +162,7 @@ def _ray_counts(measurement: Measurement, grid: Grid) -> list[tuple[int, int]]:
 
 def _lens_rays(measurement: Measurement, grid: Grid) -> int:
     """Return the largest number of rays per pixel, from a lattice of pixels of each image."""
-    most, measurement = 1, over_pixels(measurement, grid)
+    most = 1
     for camera in measurement.cameras:
         lattice = [torch.linspace(0, n - 1, min(n, 9), dtype=camera.intrinsics.dtype) for n in camera.image_size[::-1]]
         rays = camera.rays(torch.cartesian_prod(*lattice).reshape(-1, 2)).clip(measurement.box)
