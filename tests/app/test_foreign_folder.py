@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import os
-import shutil
 import subprocess
 import sys
 import time
@@ -21,18 +19,16 @@ from app.serving import answering, end, free_port, outside, served
 from nerif.app.elements import card
 from nerif.app.jobs import Jobs
 from nerif.app.pages import PAGES
-from nerif.app.private import secret
 from nerif.app.project import Project
 from nerif.app.server import _handler
 from nerif.app.sliders import RangeSlider
 from nerif.app.workspace import Workspace
-from nerif.common.conventions import InputError
 from refusals import refused
 
 MODULES = ("numpy", "psutil", "torch", "types", "lazy_loader", "multiprocessing", "selectors", "nicegui", "zarr")
 PLANTED = {
     "id": "planted", "title": "<b>planted</b>", "arguments": ["--version"], "attempt": ["--version"], "folder": "/",
-    "out": "../../elsewhere", "request": "", "place": -1.0, "signature": "0" * 64,
+    "out": "../../elsewhere", "request": "", "place": -1.0,
 }  # fmt: skip
 
 
@@ -43,14 +39,14 @@ def plant(folder: Path, modules: Sequence[str] = MODULES) -> None:
     (folder / ".numba_config.yaml").write_text("CACHE_DIR: compiled\n")  # which Numba unpickles
     where = folder / ".nerif" / "jobs" / "planted"
     where.mkdir(parents=True)
-    (where / "waiting").touch()
     (where / "job.json").write_text(json.dumps(PLANTED))
 
 
 def ended(jobs: Jobs, id: str) -> str:
-    """Wait for the end of a run, and return its state; another process or this one advances the queue."""
+    """Wait for the end of a run, and return its state."""
     until = time.monotonic() + 60
     while (state := jobs.get(id).state) in ("queued", "running"):
+        jobs.advance()
         assert time.monotonic() < until
         time.sleep(0.05)
     return state
@@ -72,7 +68,7 @@ def test_the_app_runs_nothing_of_a_folder_and_its_users_run_nonetheless(tmp_path
         finally:
             end(server.pid, server.stdout)
     assert "m.nc" in jobs.log(own)[-1]
-    assert jobs.get("planted").state == "refused"
+    assert jobs.get("planted").state == "held"
     assert not (jobs.directory / "planted" / "log.txt").exists()
     assert not (tmp_path / "mark").exists()
 
@@ -117,51 +113,18 @@ def test_a_name_gives_an_element_no_property_of_its_own(title):
         assert slider._input.props["aria-valuetext"] == title
 
 
-def test_a_run_that_is_not_signed_is_shown_and_never_started(tmp_path):
+def test_a_run_that_was_found_is_shown_and_starts_only_by_hand(tmp_path):
     plant(tmp_path, ())
     jobs = Jobs(tmp_path)
     jobs.advance()
-    assert [(job.id, job.state, job.resumable) for job in jobs.all()] == [("planted", "refused", False)]
-    for action in (jobs.resume, jobs.first):
-        with refused("job planted"):
-            action("planted")
+    assert [(job.id, job.state, job.line) for job in jobs.all()] == [("planted", "held", "nerif --version")]
+    jobs.first("planted")
+    jobs.advance()
+    assert not (jobs.directory / "planted" / "log.txt").exists()
     jobs.stop("planted")
-    assert jobs.all()[0].state == "refused"
+    assert jobs.all()[0].state == "stopped"
     jobs.remove("planted")
     assert jobs.all() == []
-
-
-@pytest.mark.parametrize("change", ["arguments", "folder", "copy", "secret"])
-def test_a_signature_holds_for_one_run_in_one_folder_by_one_user(tmp_path, monkeypatch, change):
-    first, second = tmp_path / "first", tmp_path / "second"
-    first.mkdir()
-    where = Jobs(first).directory / Jobs(first).add(("info", "m.nc"), "own").id
-    assert Jobs(first).all()[0].state == "queued"
-    if change == "arguments":
-        (where / "job.json").write_text((where / "job.json").read_text().replace("m.nc", "n.nc"))
-    elif change == "folder":
-        first.rename(second)
-    elif change == "copy":
-        shutil.copytree(where, where.with_name("again"))
-        shutil.rmtree(where)
-    else:
-        monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state of another user"))
-    assert [job.state for job in Jobs(second if change == "folder" else first).all()] == ["refused"]
-
-
-def test_the_secret_is_the_users_alone(tmp_path, monkeypatch):
-    def no_links(*_):
-        raise PermissionError("a file system without links")
-
-    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
-    monkeypatch.setattr(os, "link", no_links)
-    assert secret() == secret()
-    path = tmp_path / "nerif" / "secret"
-    assert path.stat().st_mode & 0o777 == 0o600
-    assert [p.name for p in path.parent.iterdir()] == ["secret"]
-    path.chmod(0o644)
-    with pytest.raises(InputError, match=r"expected 32 bytes that only you can read .* delete it"):
-        Jobs(tmp_path)
 
 
 def run(words: Sequence[str], folder: Path) -> subprocess.CompletedProcess[str]:

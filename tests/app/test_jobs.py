@@ -13,11 +13,12 @@ import psutil
 import pytest
 
 from nerif.app import runner
-from nerif.app.jobs import Job, Jobs, claim
+from nerif.app.jobs import Job, Jobs
 from nerif.app.result_volumes import film_progress
 from nerif.cli.cli import main
 from nerif.common.files import write_json
 from nerif.common.installation import command_line
+from nerif.common.locks import locked
 from refusals import refused
 
 HELP = ("--version",)
@@ -107,14 +108,13 @@ def test_a_number_of_a_process_that_was_given_again_is_no_run(tmp_path, process)
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere the system keeps the time of day at the start")
 def test_a_clock_that_is_set_starts_nothing_twice(tmp_path, process, monkeypatch):
     jobs = Jobs(tmp_path)
-    running, claimed = sleeping(jobs, process), jobs.add(HELP, "x").id
-    assert claim(jobs.directory / claimed, process.pid)
+    id = sleeping(jobs, process)
     boot = psutil.boot_time()
     monkeypatch.setattr("psutil._pslinux.boot_time", lambda: boot + 3600)  # as by a clock that is an hour ahead
-    assert [jobs.get(id).state for id in (running, claimed)] == ["running", "running"]
+    assert jobs.get(id).state == "running"
     jobs.at_once = 3
     jobs.advance()
-    assert not (jobs.directory / claimed / "log.txt").exists()
+    assert not (jobs.directory / id / "log.txt").exists()
 
 
 def test_what_is_paused_goes_on_from_its_checkpoint(tmp_path, process):
@@ -142,8 +142,6 @@ def test_what_is_asked_while_a_run_starts_is_heard(tmp_path):
     jobs = Jobs(tmp_path)
     job = jobs.add(["demo", "--out", "demo"], "a demo", "demo")
     where = jobs.directory / job.id
-    assert claim(where, os.getpid())
-    assert jobs.get(job.id).state == "running"
     jobs.stop(job.id)
     runner.main(where, job.attempt)
     assert jobs.get(job.id).state == "stopped"
@@ -157,28 +155,30 @@ def test_a_run_outlives_the_server(tmp_path):
     assert until(Jobs(tmp_path), done.stdout.strip(), "done").code == 0
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("last", ["subprocess.Popen", "json.dumps"])  # of a start: before and after the claim
-def test_a_server_killed_while_it_starts_a_run_leaves_it_to_the_next(tmp_path, last):
-    code = "import json, os, subprocess, sys; from nerif.app.jobs import Jobs; from pathlib import Path;"
-    code += "jobs = Jobs(Path(sys.argv[1])); print(jobs.add(('--version',), 'x').id, flush=True);"
-    code += f"{last} = lambda *_, **__: os._exit(9); jobs.advance()"
-    killed = subprocess.run([sys.executable, "-c", code, str(tmp_path)], stdout=subprocess.PIPE, text=True)
-    assert killed.returncode == 9
-    id = killed.stdout.strip()
-    assert until(Jobs(tmp_path), id, "done").code == 0
-    assert len(Jobs(tmp_path).log(id)) == 1  # it ran once
+def test_a_run_of_an_earlier_server_or_another_person_waits_until_it_is_started(tmp_path):
+    id = Jobs(tmp_path).add(("reconstruct", "nowhere.nc", "--out", "r"), "x", "r").id
+    (tmp_path / "r").mkdir()
+    (tmp_path / "r" / "run.toml").write_text("")  # of another run
+    jobs, other = Jobs(tmp_path), Jobs(tmp_path)
+    jobs.advance()
+    assert [jobs.get(id).state, jobs.log(id)] == ["held", []]
+    jobs.start(id)
+    assert (jobs.get(id).state, other.get(id).state) == ("queued", "held")
+    assert until(jobs, id, "failed").code == 2
+    assert "nowhere.nc" in jobs.log(id)[-1]
+    other.start(id)
+    assert other.get(id).state == "failed"
 
 
-def test_a_run_belongs_to_one_process_until_that_has_gone(tmp_path, process):
-    where = Jobs(tmp_path).directory / Jobs(tmp_path).add(HELP, "x").id
-    assert claim(where, process.pid)
-    assert not claim(where, os.getpid())
-    process.kill()
-    process.wait()
-    assert claim(where, os.getpid())
-    assert not claim(where, os.getpid())
-    assert Jobs(tmp_path).all()[0].state == "running"
+def test_two_processes_of_one_run_start_it_once(tmp_path):
+    jobs = Jobs(tmp_path)
+    job = jobs.add(HELP, "x")
+    where = jobs.directory / job.id
+    with locked(where, inside=True), refused(where):
+        runner.main(where, HELP)
+    for _ in range(2):
+        runner.main(where, HELP)
+    assert len(jobs.log(job.id)) == 1
 
 
 def test_a_process_that_cannot_start_a_run_says_why(tmp_path, monkeypatch):

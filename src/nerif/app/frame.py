@@ -14,7 +14,7 @@ from nicegui import ui
 
 from nerif.app.elements import dialog, refusals, text_html
 from nerif.app.guide import guide
-from nerif.app.jobs import REFUSED, Job
+from nerif.app.jobs import OPEN, Job
 from nerif.app.result_volumes import film_progress
 from nerif.app.workspace import READ_ONLY, Workspace
 from nerif.common.files import ending
@@ -32,11 +32,11 @@ ACTIONS = {
     "done": ("remove",),
     "failed": ("resume", "remove"),
     "stopped": ("resume", "remove"),
-    "refused": ("remove",),
+    "held": ("start", "remove"),
 }
 NAMES = {
     "pause": "Pause", "stop": "Stop", "resume": "Go on", "remove": "Forget", "first": "Next", "earlier": "Earlier",
-    "later": "Later",
+    "later": "Later", "start": "Start",
 }  # fmt: skip
 
 
@@ -148,7 +148,7 @@ class JobsDrawer:
 
     async def _refresh(self) -> None:
         jobs, progress = await self.work.in_thread(self._jobs)
-        open_ = sum(job.state in ("running", "queued", "paused") for job in jobs)
+        open_ = sum(job.state in OPEN for job in jobs)
         self.button.set_text(f"Runs ({open_})" if open_ else "Runs")
         state = repr([(j.id, j.state, j.request, j.place) for j in jobs]) + repr(progress)
         if state == self._state:
@@ -173,8 +173,8 @@ class JobsDrawer:
                 f"<b>{escape(job.title)}</b><span class=state>{escape(state)} {escape(title)}</span>"
                 f"<code>{escape(job.line)}</code>", sanitize=False,
             )  # fmt: skip
-            if job.state == "refused":
-                text_html(REFUSED, classes="note")
+            if job.state == "held":
+                text_html("Queued with an earlier server. Read its command line before you start it.", classes="note")
             if job.state == "running" and share:
                 ui.linear_progress(share, show_value=False).props["aria-label"] = job.title
             with ui.row().classes("gap-1"):

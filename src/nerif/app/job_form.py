@@ -10,7 +10,7 @@ from nicegui import ui
 from nerif.app.elements import CommandLine, refusals, text_html
 from nerif.app.form_view import FormView
 from nerif.app.forms import Form
-from nerif.app.jobs import REFUSED, Job
+from nerif.app.jobs import Job
 from nerif.app.workspace import Workspace
 from nerif.common.conventions import InputError
 
@@ -18,7 +18,7 @@ __all__ = ["JobForm", "JobStatus"]
 
 EVERY = 0.7  # seconds
 LINES = 3  # of the log
-ENDS = {"done": "It is done.", "failed": "It failed; end of the log:", "stopped": "It was stopped.", "refused": REFUSED}
+ENDS = {"done": "It is done.", "failed": "It failed; end of the log:", "stopped": "It was stopped."}
 
 
 class JobForm:
@@ -143,7 +143,8 @@ class JobStatus:
             return
         lines = [line.rpartition("\r")[2] for line in log]  # the last state of a progress bar
         if job.state not in ENDS:
-            self._show("It waits in the queue." if job.state == "queued" else f"It is {job.state}.", lines[-1:])
+            waits = {"queued": "It waits in the queue.", "held": "Start it under Runs: another server queued it."}
+            self._show(waits.get(job.state, f"It is {job.state}."), lines[-1:])
             return
         self._show(ENDS[job.state], lines)
         self._forget()

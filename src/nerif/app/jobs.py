@@ -1,22 +1,17 @@
 """Queue of runs of `nerif ...` on disk, which survives a restart of the server.
 
 Each run has a folder in FOLDER/.nerif/jobs with job.json (the request), log.txt, and started.json and ended.json of its
-process (runner.py); there is no other state. The name of an empty file is the owner of the run: `waiting`, and once a
-server has started a process for it, runner-PID-START of that process. A server claims a run by renaming this file,
-which only one server can do. If the process disappears before the run starts, the run is queued again.
+process (runner.py). A server starts the runs that were queued with it. Those of an earlier server, or of a folder from
+another user, are held: listed with their command line until they are started by hand.
 
-A folder may come from another user and contain runs. job.json is signed with a secret of the user (private.py); a run
-without signature, with changes, or signed for another folder, is refused: listed, but never started.
-
-    queued ─▶ running ─▶ done | failed | stopped
-                 │
-                 └─▶ paused ─▶ queued ...          stopped, then continued: nerif reconstruct by --resume, nerif
-                                                  sequence by the same command, which adds the missing frames
+    held ─▶ queued ─▶ running ─▶ done | failed | stopped
+                         │
+                         └─▶ paused ─▶ queued ...      stopped, then continued: nerif reconstruct by --resume, nerif
+                                                      sequence by the same command, which adds the missing frames
 """
 
 from __future__ import annotations
 
-import hmac
 import json
 import secrets
 import shutil
@@ -25,13 +20,11 @@ import sys
 import threading
 import time
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from nerif.app.private import secret
 from nerif.app.project import OWN
 from nerif.app.runner import ENDED, JOB, LOG, STARTED, began
 from nerif.common.conventions import InputError
@@ -40,17 +33,11 @@ from nerif.common.installation import command_line
 from nerif.common.interruption import interrupt
 from nerif.results.directory import RUN
 
-__all__ = ["REFUSED", "Job", "Jobs"]
+__all__ = ["OPEN", "Job", "Jobs"]
 
-WAITING, OWNER = "waiting", "runner-"
 LIMIT = 64  # simultaneous runs
 RESUMABLE = ("reconstruct", "sequence")
-OVER = ("done", "failed", "stopped", "refused")
-REFUSED = (
-    "This run was not queued by you in this folder, or it was changed, or the folder was moved. It is not started; "
-    "start the run again from its page."
-)
-"""Message of a run without a valid signature."""
+OPEN = ("running", "queued", "held", "paused")
 
 
 @dataclass(frozen=True)
@@ -66,7 +53,7 @@ class Job:
     out : result directory relative to the folder; empty if the run writes none
     request : "", "stop" or "pause"
     place : sort key in the queue
-    state : queued, running, paused, done, failed, stopped or refused
+    state : held, queued, running, paused, done, failed or stopped
     pid : process id while it runs
     code : exit code after the end
     started, ended : seconds since the epoch, 0 before
@@ -98,13 +85,12 @@ class Job:
     @property
     def resumable(self) -> bool:
         """Whether it can be paused: stopped and continued later."""
-        return self.arguments[0] in RESUMABLE and bool(self.out) and self.state != "refused"
+        return self.arguments[0] in RESUMABLE and bool(self.out)
 
 
 ENTRIES: dict[str, type | tuple[type, ...]] = {
     "id": str, "title": str, "arguments": list, "attempt": list, "out": str, "request": str, "place": (int, float),
 }  # fmt: skip
-SIGNATURE = "signature"
 
 
 class Jobs:
@@ -117,17 +103,15 @@ class Jobs:
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.directory = folder, folder / OWN / "jobs"
-        self._secret = secret()
+        self._own: dict[str, subprocess.Popen[bytes] | None] = {}  # runs queued here, by their process once started
 
     # -- state ---------------------------------------------------------------------------------------------------
 
     def all(self) -> list[Job]:
         """Return all runs: open ones in the order of the queue, then ended ones, latest first."""
         jobs = [job for job in map(self._read, self._names()) if job is not None]
-        open_, over = ("running", "queued", "paused"), [j for j in jobs if j.state in OVER]
-        return sorted((j for j in jobs if j.state in open_), key=lambda j: (open_.index(j.state), j.place)) + sorted(
-            over, key=lambda j: j.ended, reverse=True
-        )
+        open_ = sorted((j for j in jobs if j.state in OPEN), key=lambda j: (OPEN.index(j.state), j.place))
+        return open_ + sorted((j for j in jobs if j.state not in OPEN), key=lambda j: j.ended, reverse=True)
 
     def get(self, id: str) -> Job:
         """Return one run; InputError if there is none with this id."""
@@ -156,14 +140,10 @@ class Jobs:
     def _read(self, name: str) -> Job | None:
         """Return a run and its state; None if its folder is damaged or being removed."""
         where = self.directory / name
-        content = _json(where / JOB)
-        entries, signature = {k: v for k, v in content.items() if k in ENTRIES}, content.get(SIGNATURE)
-        if not _is_job(entries):
+        entries = {k: v for k, v in _json(where / JOB).items() if k in ENTRIES}
+        if not _is_job(entries) or entries["id"] != name:
             return None
         job = Job(**{**entries, "arguments": tuple(entries["arguments"]), "attempt": tuple(entries["attempt"])})
-        if job.id != name or not hmac.compare_digest(str(signature).encode(), self._signature(entries).encode()):
-            return replace(job, id=name, state="refused", ended=(where / JOB).stat().st_mtime)
-        alive = _owner_alive(_owner(where))  # before ended.json is read, which is written just before the process ends
         started, ended = _json(where / STARTED), _json(where / ENDED)
         if ended:
             job = replace(job, code=int(ended["code"]), started=started.get("time", 0.0), ended=ended["time"])
@@ -173,12 +153,14 @@ class Jobs:
             return replace(job, state=over if job.request or not job.code else "failed")
         if started:
             job = replace(job, started=started["time"], pid=int(started["pid"]))
-            if alive or began(job.pid) == str(started["began"]):
+            if began(job.pid) == str(started["began"]) or _is_alive(self._own.get(name)):
                 return replace(job, state="running")
             return replace(job, state="stopped" if job.request else "failed", ended=(where / STARTED).stat().st_mtime)
         if job.request:
             return replace(job, state="stopped")
-        return replace(job, state="running" if alive else "queued")
+        if name not in self._own:
+            return replace(job, state="held")
+        return replace(job, state="queued" if self._own[name] is None else "running")
 
     # -- requests ------------------------------------------------------------------------------------------------
 
@@ -197,7 +179,7 @@ class Jobs:
         words = tuple(str(word) for word in arguments)
         job = Job(name, title, words, words, str(out), place=time.time())
         self._of(job).mkdir(parents=True)
-        (self._of(job) / WAITING).touch()
+        self._own[name] = None
         self._write(job)
         return job
 
@@ -213,8 +195,13 @@ class Jobs:
             )
         self._request(id, "pause")
 
+    def start(self, id: str) -> None:
+        """Queue a held run with this server."""
+        if self.get(id).state == "held":
+            self._own[id] = None
+
     def resume(self, id: str) -> None:
-        """Queue an ended run again, from its checkpoint if there is one; InputError if it is refused."""
+        """Queue an ended run again, from its checkpoint if there is one."""
         job = self.get(id)
         if job.state in ("queued", "running"):
             return
@@ -224,6 +211,7 @@ class Jobs:
         elif job.resumable and (self.folder / job.out / RUN).is_file():
             attempt = (job.arguments[0], "--resume", "--out", job.out, *(("--live",) if "--live" in attempt else ()))
         self._write(replace(job, attempt=attempt, request="", place=time.time()))
+        self._own[id] = None
         for name in (STARTED, ENDED):  # the run is queued once both are removed
             (self._of(job) / name).unlink(missing_ok=True)
 
@@ -271,7 +259,7 @@ class Jobs:
 
     def _request(self, id: str, request: str) -> None:
         job = self.get(id)
-        if job.state not in ("queued", "running", "paused"):
+        if job.state not in OPEN:
             return
         self._write(replace(job, request=request))
         now = self._read(id)  # it may have started meanwhile; one that starts later reads the request
@@ -279,15 +267,7 @@ class Jobs:
             interrupt(now.pid)
 
     def _write(self, job: Job) -> None:
-        if job.state == "refused":
-            raise InputError(str(REFUSED), field=f"job {job.id}")
-        entries = {name: value for name, value in asdict(job).items() if name in ENTRIES}
-        write_json(self._of(job) / JOB, {**entries, SIGNATURE: self._signature(entries)})
-
-    def _signature(self, entries: Mapping[str, Any]) -> str:
-        """Return the signature of a run of this user in this folder."""
-        words = json.dumps([str(self.folder), entries], sort_keys=True)
-        return hmac.new(self._secret, words.encode(), "sha256").hexdigest()
+        write_json(self._of(job) / JOB, {name: value for name, value in asdict(job).items() if name in ENTRIES})
 
     # -- the queue -----------------------------------------------------------------------------------------------
 
@@ -301,19 +281,14 @@ class Jobs:
     def _launch(self, job: Job) -> None:
         where = self._of(job)
         with (where / LOG).open("ab") as log:  # the runner prints why it could not start the run
-            runner = subprocess.Popen(
-                [sys.executable, "-P", "-m", "nerif.app.runner", str(where)], stdin=subprocess.PIPE,
+            runner = self._own[job.id] = subprocess.Popen(
+                [sys.executable, "-P", "-m", "nerif.app.runner", str(where), *job.attempt], stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL, stderr=log, start_new_session=True,
             )  # fmt: skip
-        assert runner.stdin is not None
-        is_claimed = claim(where, runner.pid)
-        with suppress(BrokenPipeError), runner.stdin as order:  # the end of the runner is handled below
-            if is_claimed:
-                order.write(json.dumps(job.attempt).encode())
 
         def wait() -> None:
-            code = runner.wait()  # the system may reuse the pid only after this
-            if is_claimed and code and not (where / STARTED).exists():
+            code = runner.wait()
+            if code and not (where / STARTED).exists():
                 write_json(where / ENDED, {"code": code, "time": time.time()})
 
         threading.Thread(target=wait, daemon=True).start()
@@ -326,28 +301,8 @@ def _is_job(entries: Mapping[str, Any]) -> bool:
     return all(words and all(isinstance(w, str) for w in words) for words in (entries["arguments"], entries["attempt"]))
 
 
-def _owner(where: Path) -> Path:
-    """Return the file whose name is the owner of a run."""
-    return next(where.glob(f"{OWNER}*"), where / WAITING)
-
-
-def _owner_alive(owner: Path) -> bool:
-    """Return whether the process that owns a run is alive."""
-    _, _, process = owner.name.partition(OWNER)
-    pid, _, start = process.partition("-")
-    return bool(start) and began(int(pid)) == start
-
-
-def claim(where: Path, pid: int) -> bool:
-    """Make a process the owner of a run; False if another process owns it or the run is removed."""
-    owner = _owner(where)
-    if _owner_alive(owner):
-        return False
-    try:
-        owner.rename(where / f"{OWNER}{pid}-{began(pid)}")
-    except FileNotFoundError:  # another server was faster
-        return False
-    return True
+def _is_alive(process: subprocess.Popen[bytes] | None) -> bool:
+    return process is not None and process.poll() is None
 
 
 def _json(path: Path) -> dict[str, Any]:

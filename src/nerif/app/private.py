@@ -1,9 +1,8 @@
-"""Files that only the user can read, in $XDG_STATE_HOME/nerif (default ~/.local/state/nerif)."""
+"""A page that only the user can read, in $XDG_STATE_HOME/nerif (default ~/.local/state/nerif)."""
 
 from __future__ import annotations
 
 import os
-import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
 from html import escape
@@ -11,11 +10,8 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 from nerif.common.conventions import InputError
-from nerif.common.locks import locked
 
-__all__ = ["page_leading_to", "secret"]
-
-LENGTH = 32  # of the secret, bytes
+__all__ = ["page_leading_to"]
 
 
 def _directory() -> Path:
@@ -44,27 +40,6 @@ def _unwritable(where: Path, error: OSError) -> InputError:
         "set XDG_STATE_HOME to a directory that you can write to",
         field=where,
     )
-
-
-def secret() -> bytes:
-    """Return the key that signs runs, one per user; InputError if other users may have read or changed it."""
-    path = _directory() / "secret"
-    if not path.exists():
-        part = path.with_name(f".{secrets.token_hex(8)}")
-        _write(part, secrets.token_bytes(LENGTH))
-        with locked(path, wait=True):  # two servers started at once share the key of the first
-            part.unlink() if path.exists() else part.rename(path)
-    with path.open("rb") as file:
-        about, content = os.fstat(file.fileno()), file.read()
-    is_private = os.name != "posix" or (about.st_uid == os.geteuid() and not about.st_mode & 0o077)
-    if not is_private or len(content) != LENGTH:
-        got = f"{len(content)} bytes with mode {about.st_mode & 0o777:03o} of user {about.st_uid}"
-        raise InputError(
-            f"expected {LENGTH} bytes that only you can read (mode 600), got {got}; delete it, and start "
-            "queued runs again from their pages",
-            field=path,
-        )
-    return content
 
 
 @contextmanager

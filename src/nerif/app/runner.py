@@ -1,7 +1,7 @@
-"""Run nerif in a process that outlives the server: `python -m nerif.app.runner DIRECTORY`.
+"""Run nerif in a process that outlives the server: `python -m nerif.app.runner DIRECTORY ARGUMENTS`.
 
-The arguments of nerif come as JSON on standard input; if it ends without any (the server was killed), nothing starts.
-The process id with its start time, and later the exit code, are written to the directory.
+The process id with its start time, and later the exit code, are written to the directory. Of two processes of one
+directory, the second starts nothing.
 """
 
 from __future__ import annotations
@@ -13,10 +13,13 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
+from nerif.common.conventions import InputError
 from nerif.common.files import write_json
 from nerif.common.interruption import OWN_GROUP, interrupt
+from nerif.common.locks import locked
 
 __all__ = ["ENDED", "JOB", "LOG", "STARTED", "began", "main"]
 
@@ -24,7 +27,13 @@ JOB, STARTED, ENDED, LOG = "job.json", "started.json", "ended.json", "log.txt"
 
 
 def main(directory: Path, words: Sequence[str]) -> None:
-    """Run nerif with these arguments and wait for its end."""
+    """Run nerif with these arguments and wait for its end, unless that has been started already."""
+    with locked(directory, inside=True):
+        if not (directory / STARTED).exists():
+            _run(directory, words)
+
+
+def _run(directory: Path, words: Sequence[str]) -> None:
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may have set it to be ignored
     arguments = [sys.executable, "-P", "-m", "nerif", *words]  # -P: import no module of the folder
     environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
@@ -62,5 +71,5 @@ def began(pid: int) -> str:
 
 
 if __name__ == "__main__":
-    if order := sys.stdin.read():
-        main(Path(sys.argv[1]), json.loads(order))
+    with suppress(InputError):  # another process runs it
+        main(Path(sys.argv[1]), sys.argv[2:])
