@@ -12,12 +12,12 @@ import pytest
 from app.serving import Served, opened, served
 from app.test_accessibility import CUT, PHONE, RULES, axe, metrics, settled
 from app.test_check_and_masks import click, ended
-from app.test_jobs import until
 from app.test_results import result, tab
 from nerif.app import demo
 from nerif.app.forms import Form
-from nerif.app.guide import HINTS, progress_of
-from nerif.app.jobs import Job, Jobs
+from nerif.app.guide import state
+from nerif.app.jobs import Jobs
+from nerif.app.page import Page
 from nerif.app.pages import PAGES
 from nerif.app.pages.check import VIEW_SETTINGS, findings_file
 from nerif.app.pages.displacement import BY_PAGE
@@ -37,8 +37,7 @@ from nerif.simulation.simulate import Simulation
 from refusals import refused
 from report.browsing import errors, needs_browser, text, wait_for
 
-TITLES = {page.name: page.title for page in PAGES}
-ORDER = list(TITLES)
+HINTS = [page.hint for page in PAGES]
 LONGEST = 300.0  # seconds of the whole walk; 122 beside other work on two cores
 LONGEST_RUN = 90.0  # seconds of the reconstruction, without imports and report
 STATUS = "document.querySelector('.guide .status')?.textContent"
@@ -124,9 +123,9 @@ def test_the_default_folder_is_a_new_one(tmp_path, renders, monkeypatch):
 # -- the hints ---------------------------------------------------------------------------------------------------
 
 
-def test_every_page_has_a_hint_in_plain_sentences():
-    assert list(HINTS) == ORDER
-    for hint in HINTS.values():
+def test_hints_are_plain_sentences_and_name_steps_with_an_output():
+    for hint in HINTS:
+        assert not hint.before or next(page.hint.done for page in PAGES if page.name == hint.before)
         assert all(words.endswith(".") for words in (hint.purpose, hint.click, hint.look))
         assert ("Fill in the values" in hint.click) == bool(hint.values)
 
@@ -137,7 +136,7 @@ def test_values_of_the_hints_are_valid_in_their_forms():
         "displacement.run": Form(Displacement(Path("."), Path("."), Path("m.nc")), without=BY_PAGE),
         "check.views": Form(Check(Path("m.nc")), only=VIEW_SETTINGS),
     }
-    entries = {key: dict(values) for hint in HINTS.values() for key, values in hint.values.items()}
+    entries = {key: dict(values) for hint in HINTS for key, values in hint.values.items()}
     run = entries.pop("reconstruct")
     forms["run"], entries["run"] = form_of(run["method"], run["preset"]), run["values"]
     assert set(forms) == set(entries)
@@ -147,30 +146,26 @@ def test_values_of_the_hints_are_valid_in_their_forms():
     assert "max_steps" in run["values"]  # it ends by steps
 
 
-def test_progress_follows_the_files_and_the_runs(tmp_path):
+def test_states_follow_the_files(tmp_path):
     folder = marked(tmp_path / "demo")
-    work = Workspace(Project(folder))
+    work, pages = Workspace(Project(folder)), {page.name: page for page in PAGES}
 
-    def sentence(page: str) -> str:
-        return progress_of(work).sentence(page, TITLES)
+    def sentence(name: str) -> str:
+        return state(work, pages[name], PAGES)[0]
 
-    def after(page: str) -> str:
-        return progress_of(work).next_page(page, ORDER)
+    def after(name: str) -> tuple[str, str]:
+        _, word, page = state(work, pages[name], PAGES)
+        return word, page.name if page else ""
 
     assert sentence("design") == sentence("images") == ""
     assert sentence("calibration") == "Not done yet."
     assert sentence("displacement") == "First complete the step Calibration."
-    assert after("displacement") == "calibration"
+    assert after("displacement") == ("Back to", "calibration")
     assert sentence("results") == "First complete the step Reconstruct."
-    job = work.jobs.add(["calibrate", "images"], "calibrate")
-    assert sentence("calibration").startswith("In progress")
-    until(work.jobs, job.id, "failed")  # there are no images
-    assert sentence("calibration").startswith("The last run failed")
     write_cameras(folder / "calibration.toml", [CalibratedCamera.from_camera(camera) for camera in cameras()])
     assert sentence("calibration") == "Done."
-    assert progress_of(work).is_ready("calibration")
     assert sentence("displacement") == "Not done yet."
-    assert after("displacement") == "check"
+    assert after("displacement") == ("Next:", "check")
     Simulation(phantom="gaussians", truth_voxels=6)(cameras())[0].write(folder / "measurement.nc")
     assert sentence("displacement") == "Done."
     assert sentence("check") == sentence("reconstruct") == "Not done yet."
@@ -181,12 +176,9 @@ def test_progress_follows_the_files_and_the_runs(tmp_path):
     assert sentence("reconstruct") == "Not done yet."
     result(folder / "results" / "b", 8, 0.0)
     assert sentence("reconstruct") == "Done."
-    paused = Job("x", "run", ("reconstruct", "measurement.nc"), ("reconstruct",), state="paused")
-    work.jobs.all = lambda: [paused]
-    assert sentence("reconstruct") == "The run is paused; press Go on."
-    del work.jobs.all
-    assert sentence("results") == ""
-    assert after("results") == ""
+    assert sentence("results").startswith("This was the last page")
+    more = Page("more", "More", "/more", "A page without a hint.", lambda work: None)
+    assert state(work, PAGES[0], (*PAGES, more))[2] is PAGES[1]
 
 
 @pytest.fixture(scope="module")

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Awaitable, Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import cache
 from html import escape
 from pathlib import Path
@@ -15,12 +14,13 @@ from nicegui import ui
 from nerif.app.elements import dialog, refusals, text_html
 from nerif.app.guide import guide
 from nerif.app.jobs import OPEN, Job
+from nerif.app.page import Page
 from nerif.app.result_volumes import film_progress
 from nerif.app.workspace import READ_ONLY, Workspace
 from nerif.common.files import ending
 from nerif.results.live import read_live
 
-__all__ = ["JobsDrawer", "Page", "frame"]
+__all__ = ["JobsDrawer", "frame"]
 
 ASSETS = Path(__file__).parent / "assets"
 EVERY = 1.0  # seconds
@@ -38,26 +38,6 @@ NAMES = {
     "pause": "Pause", "stop": "Stop", "resume": "Go on", "remove": "Forget", "first": "Next", "earlier": "Earlier",
     "later": "Later", "start": "Start",
 }  # fmt: skip
-
-
-@dataclass(frozen=True)
-class Page:
-    """One page of the app.
-
-    Parameters
-    ----------
-    name : one word, the key of its draft
-    title : its heading
-    path : path of its address
-    about : one sentence below the title
-    build : builds it within the frame; a coroutine function where it waits for something
-    """
-
-    name: str
-    title: str
-    path: str
-    about: str
-    build: Callable[[Workspace], Awaitable[None] | None]
 
 
 @cache

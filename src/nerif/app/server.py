@@ -19,8 +19,9 @@ from nicegui import app, background_tasks, ui
 from nicegui.server import Server
 from starlette.responses import RedirectResponse
 
-from nerif.app.frame import Page, frame
+from nerif.app.frame import frame
 from nerif.app.guard import Guard
+from nerif.app.page import Page
 from nerif.app.pages import PAGES
 from nerif.app.private import page_leading_to
 from nerif.app.project import Project

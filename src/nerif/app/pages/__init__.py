@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from nerif.app.frame import Page
+from nerif.app.page import Page
 from nerif.app.pages import calibration, check, design, displacement, images, reconstruct, results
 
 __all__ = ["PAGES"]

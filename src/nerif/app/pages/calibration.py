@@ -11,9 +11,9 @@ from nicegui import ui
 from nerif.app.elements import CommandLine, card, refusals, select, text_html
 from nerif.app.form_view import FormView
 from nerif.app.forms import Form
-from nerif.app.frame import Page
 from nerif.app.job_form import JobStatus
 from nerif.app.jobs import Job
+from nerif.app.page import Hint, Page
 from nerif.app.project import Contents
 from nerif.app.rig_scene import read_rig, show_rig
 from nerif.app.target_images import TargetImages
@@ -259,4 +259,11 @@ async def build(work: Workspace) -> None:
 
 
 ABOUT = "Where the cameras stand and what they see, from images of a target or from a ruler."
-PAGE = Page("calibration", "Calibration", "/calibration", ABOUT, build)
+HINT = Hint(
+    "Computes where the cameras are from images of a chessboard in several poses.",
+    "Press Calibrate. The settings come from the file beside the images. It takes about 10 s.",
+    "The reprojection errors should be a small fraction of a pixel. Turn the rig in 3-D: six cameras, each with "
+    "its background behind the flow.",
+    done=lambda work: bool(work.project.contents().calibrations),
+)
+PAGE = Page("calibration", "Calibration", "/calibration", ABOUT, build, HINT)

@@ -12,9 +12,9 @@ from PIL import Image
 from nerif.analysis.consistency_file import CheckFindings, read_findings
 from nerif.app.elements import CommandLine, FileChoice, card, items_html, refusals, table_html, text_html
 from nerif.app.forms import Form
-from nerif.app.frame import Page
 from nerif.app.job_form import JobForm, JobStatus
 from nerif.app.jobs import Job
+from nerif.app.page import Hint, Page
 from nerif.app.project import OWN
 from nerif.app.workspace import Workspace
 from nerif.cli.commands.body import BodyInFlow
@@ -213,4 +213,13 @@ async def build(work: Workspace) -> None:
     CheckPage(work, measurements, await work.models())
 
 
-PAGE = Page("check", "Check", "/check", "Errors of the data and of the calibration, before the reconstruction.", build)
+HINT = Hint(
+    "Predicts each view from the others, and so detects mirrored, exchanged or wrongly signed images.",
+    "Fill in the values: few voxels, for a quick comparison. Press Compare the views.",
+    "All views should agree: an agreement of about 0.7 or more, a gain near 1, and no problems.",
+    before="displacement",
+    values={"check.views": {"voxels": 12}},
+    done=lambda work: any((work.project.folder / OWN / "checks").rglob("*.json")),
+)
+ABOUT = "Errors of the data and of the calibration, before the reconstruction."
+PAGE = Page("check", "Check", "/check", ABOUT, build, HINT)

@@ -9,10 +9,11 @@ from html import escape
 import torch
 from nicegui import ui
 
+from nerif.app.demo import RIG
 from nerif.app.elements import CommandLine, card, figures, items_html
 from nerif.app.form_view import FormView
 from nerif.app.forms import Form
-from nerif.app.frame import Page
+from nerif.app.page import Hint, Page
 from nerif.app.workspace import Workspace
 from nerif.cli.commands.design import Design
 from nerif.geometry import Camera
@@ -155,4 +156,12 @@ def _outline(camera: Camera) -> tuple[torch.Tensor, torch.Tensor]:
     return rays.origin[:, :2], rays.end_points[:, :2]
 
 
-PAGE = Page("design", "Design", "/design", "Displacement, blur and resolution of a rig before it is built.", build)
+HINT = Hint(
+    "Predicts what a rig measures before it is built: displacement, blur and resolution.",
+    "Fill in the values of the rig of this demo. Then move a slider, such as the background distance.",
+    "The displacement should be well above its noise, and the resolution finer than the structures of the flow. "
+    "The drawing shows the rig from above, to scale.",
+    values={"design": {name: list(v) if isinstance(v, tuple) else v for name, v in RIG.items()}},
+)
+ABOUT = "Displacement, blur and resolution of a rig before it is built."
+PAGE = Page("design", "Design", "/design", ABOUT, build, HINT)

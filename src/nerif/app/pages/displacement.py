@@ -8,11 +8,12 @@ from pathlib import Path
 
 from nicegui import ui
 
+from nerif.app.demo import EDGE
 from nerif.app.elements import FileChoice, card, refusals, select, text_html, work_in_progress
 from nerif.app.forms import Form
-from nerif.app.frame import Page
 from nerif.app.job_form import JobForm
 from nerif.app.mask_editor import MaskCard
+from nerif.app.page import Hint, Page
 from nerif.app.project import Contents
 from nerif.app.view_maps import maps_html
 from nerif.app.workspace import Workspace
@@ -194,4 +195,15 @@ async def build(work: Workspace) -> None:
     DisplacementPage(work, await work.contents())
 
 
-PAGE = Page("displacement", "Displacement", "/displacement", "How far the background is shifted, view by view.", build)
+HINT = Hint(
+    "Compares reference and flow of each view and computes how far the background is displaced.",
+    "Fill in the values: the corners of the box around the flow. Press Preview for one view, then Find all "
+    "displacements.",
+    "The maps of u and v show the edges of the flame; sigma is the noise of each pixel. Below, the flow can be "
+    "masked by hand; the demo does not need it.",
+    before="calibration",
+    values={"displacement.run": {"lower": [-EDGE / 2] * 3, "upper": [EDGE / 2] * 3}},
+    done=lambda work: bool(work.project.contents().measurements),
+)
+ABOUT = "How far the background is shifted, view by view."
+PAGE = Page("displacement", "Displacement", "/displacement", ABOUT, build, HINT)

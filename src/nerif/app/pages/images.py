@@ -10,7 +10,7 @@ from nicegui import ui
 
 from nerif.app.crop_editor import SOURCES, CropCard
 from nerif.app.elements import CommandLine, card, items_html, refusals, select, text_html
-from nerif.app.frame import Page
+from nerif.app.page import Hint, Page
 from nerif.app.workspace import Workspace
 from nerif.common.conventions import InputError
 from nerif.imaging.image_quality import ImageQuality
@@ -182,4 +182,10 @@ async def build(work: Workspace) -> None:
 
 
 ABOUT = "The images of a folder, their quality, and the crop of each view."
-PAGE = Page("images", "Images", "/images", ABOUT, build)
+HINT = Hint(
+    "Shows the images of each view: the background without flow (reference) and with flow.",
+    "Nothing is needed here. Look closer at a view, and press the space key to switch between reference and flow.",
+    "The dots shift by less than a pixel: too little to see in one image, enough to measure. No pixel is "
+    "saturated, and no problems are listed.",
+)
+PAGE = Page("images", "Images", "/images", ABOUT, build, HINT)

@@ -14,8 +14,8 @@ from nicegui import ui
 from nerif.app.elements import CommandLine, FileChoice, card, refusals, select, text_html
 from nerif.app.form_view import FormView
 from nerif.app.forms import Form
-from nerif.app.frame import Page
 from nerif.app.live_view import LiveView
+from nerif.app.page import Hint, Page
 from nerif.app.workspace import Workspace
 from nerif.cli.commands.reconstruct import Reconstruct, command_of
 from nerif.cli.commands.sequence import Sequence
@@ -25,6 +25,7 @@ from nerif.common.installation import word_of
 from nerif.data.measurement_sequence import MeasurementSequence
 from nerif.reconstruction.methods import METHODS
 from nerif.reconstruction.neural.presets import PRESETS, preset
+from nerif.results.directory import VOLUME
 
 __all__ = ["PAGE"]
 
@@ -176,4 +177,18 @@ def _has_measurements(work: Workspace, name: str) -> bool:
 
 
 ABOUT = "The field that explains a measurement, shown while the run improves it."
-PAGE = Page("reconstruct", "Reconstruct", "/reconstruct", ABOUT, build)
+HINT = Hint(
+    "Fits a field of refractive index to all views at once.",
+    "Fill in the values: few steps, and no withheld view, to save time. Press Start. It takes about a minute.",
+    "The loss falls, the predicted view approaches the measured one, and the isosurface becomes a flame.",
+    before="displacement",
+    values={
+        "reconstruct": {
+            "method": "nerif",
+            "preset": "fast",
+            "values": {"max_steps": 250, "withhold": ["none"], "voxels": 40},
+        }
+    },
+    done=lambda work: any((work.project.folder / name / VOLUME).is_file() for name in work.project.contents().results),
+)
+PAGE = Page("reconstruct", "Reconstruct", "/reconstruct", ABOUT, build, HINT)

@@ -11,9 +11,9 @@ from nicegui import ui
 
 from nerif.app.elements import CommandLine, card, figures, refusals, select, text_html
 from nerif.app.forms import Form
-from nerif.app.frame import Page
 from nerif.app.job_form import JobForm, JobStatus
 from nerif.app.jobs import Job
+from nerif.app.page import Hint, Page
 from nerif.app.result_table import Row, result_table, rows_of
 from nerif.app.result_view import ResultView
 from nerif.app.routes import report_address, report_file
@@ -203,4 +203,11 @@ async def build(work: Workspace) -> None:
 
 
 ABOUT = "Fields, verdicts, comparison, export."
-PAGE = Page("results", "Results", "/results", ABOUT, build)
+HINT = Hint(
+    "Shows the field with its verdict, compares results, and exports them.",
+    "Move the sliders of the slices. Then open the tabs In 3-D, Report and Export.",
+    "The verdict states whether the field can be used, and why. This short run asks for care: a longer one with a "
+    "withheld view also estimates the error.",
+    before="reconstruct",
+)
+PAGE = Page("results", "Results", "/results", ABOUT, build, HINT)
