@@ -11,6 +11,9 @@ PIP := --quiet --disable-pip-version-check --no-compile  # byte code is written 
 TORCH := torch $(if $(TORCH_INDEX),--no-deps --index-url $(TORCH_INDEX))
 PYTEST := $(BIN)/python -m pytest -n 2 --dist loadgroup --no-loadscope-reorder
 
+# byte code is kept, also where the environment says otherwise: compiling at every start takes as long as the imports
+export PYTHONDONTWRITEBYTECODE :=
+
 .PHONY: demo app test test-all short-tests all-tests lint docs dist study study-quick clean
 
 demo: .venv/.run
