@@ -88,14 +88,27 @@ def test_no_status_unless_requested(measurement, tmp_path):
     assert read_look(tmp_path) is None
 
 
-def test_writing_the_field_takes_its_share_of_the_time(measurement, tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("first", "later", "share", "longest"),  # s to write the field; then of the time, and the longest wait, s
+    [
+        (0.05, 0.05, 0.013, 6),
+        (0.17, 0.17, 0.013, 18),
+        (0.5, 0.5, 0.03, 21),  # not more often than every 20 s, at little cost
+        (5.0, 5.0, 0.11, 56),  # as of a large field
+        (2.0, 0.1, 0.03, 12),  # the first also compiles and imports
+        (30.0, 0.1, 0.2, 62),
+    ],
+)
+def test_the_field_is_written_as_often_as_its_duration_allows(
+    measurement, tmp_path, monkeypatch, first, later, share, longest
+):
     clock, looks = [0.0], []
     monkeypatch.setattr("time.monotonic", lambda: clock[0])
     status = Live(tmp_path, measurement, NeRIF())
 
     def look(title, step, withheld):
-        looks.append(clock[0])
-        clock[0] += 0.5
+        looks.append((clock[0], step.step))
+        clock[0] += later if looks[1:] else first
 
     monkeypatch.setattr(status, "_look", look)
     step = Step(1, 0.0, 0.0, 0.5, {"loss": 1.0}, 1.0, lambda: None, lambda: None)
@@ -103,5 +116,8 @@ def test_writing_the_field_takes_its_share_of_the_time(measurement, tmp_path, mo
         for i in range(4000):
             clock[0] += 0.05
             assert not on_step(replace(step, step=i))
-    assert 0.8 * live.FIELD_SHARE < len(looks) * 0.5 / clock[0] <= live.FIELD_SHARE
+    times, steps = zip(*looks, strict=True)
+    assert (first + (len(looks) - 1) * later) / clock[0] <= share
+    assert max(np.diff([0.0, *times])) <= longest
+    assert steps[-1] == 3999  # the field at the end stays to be seen
     assert len(read_live(tmp_path)["curve"]["step"]) <= live.CURVE_POINTS

@@ -1,10 +1,10 @@
 """The status of a live run, in its result directory.
 
     live.json    title, step, seconds, progress and losses with their curves: once a second at most
-    live.npz     the field on a coarse grid, and one view as measured and predicted: as often as FIELD_SHARE allows
+    live.npz     the field on a coarse grid, and one view as measured and predicted: as often as its duration allows
 
-Both are written atomically; where that fails, as on a full disk, the run goes on without them. After a field is
-written, which takes about 0.05 s, so much time passes that writing takes at most FIELD_SHARE of the run.
+Both are written atomically, and once more after the last step; where that fails, as on a full disk, the run goes on
+without them.
 """
 
 from __future__ import annotations
@@ -40,8 +40,9 @@ from nerif.results.directory import LIVE, LIVE_FIELD
 __all__ = ["Live", "Look", "read_live", "read_look"]
 
 STATUS_INTERVAL = 1.0  # s, of live.json
-FIELD_SHARE = 0.01  # of the run time, spent on live.npz
-FIELD_DELAY = 1.0  # s, before the first
+FIELD_DELAY = 1.0  # s, before the first live.npz
+FIELD_SHARE, FIELD_INTERVAL = 0.01, 20.0  # of the time that live.npz takes; s between two, where that would be longer,
+MOST_SHARE = 0.1  # unless they then took more of the time than this
 COARSE_VOXELS = 28  # along the longest edge of the box
 MAX_PIXELS = 40  # along the longest edge of the view
 RAY_SAMPLES = 24
@@ -124,28 +125,30 @@ class Live:
                 yield compose(self._writer(title, withheld, looks, newest), on_step)
             if newest:  # the last step
                 self._attempt(self._write, title, newest[0])
+                if looks:
+                    self._attempt(self._look, title, newest[0], withheld)
 
         return replace(monitor, training=training)
 
     def _writer(self, title: str, withheld: bool, looks: bool, newest: list[Step]) -> OnStep:
-        start = time.monotonic()
-        written, total, last = -STATUS_INTERVAL, 0.0, 0.0
+        status, field = time.monotonic(), time.monotonic() + FIELD_DELAY  # when each is due
+        is_first = True
         self._curve, self._interval = [], 1
 
         def on_step(step: Step) -> None:
-            nonlocal written, total, last
+            nonlocal status, field, is_first
             if not self.directory.is_dir():
                 return
             newest[:] = [step]
             self._append(step)
             now = time.monotonic()
-            if now - written >= STATUS_INTERVAL:
+            if now >= status:
                 self._attempt(self._write, title, step)
-                written = now
-            if looks and now - start >= FIELD_DELAY and total + last <= FIELD_SHARE * (now - start):
+                status = now + STATUS_INTERVAL
+            if looks and now >= field:
                 self._attempt(self._look, title, step, withheld)
-                last = time.monotonic() - now
-                total += last
+                end = time.monotonic()
+                field, is_first = end + _pause(end - now, is_first), False
 
         return on_step
 
@@ -215,6 +218,13 @@ class Live:
         usable = m.usable_for(observation)[at][..., None]
         measured = observation.values[at].where(usable, torch.tensor(float("nan")))
         return measured.numpy(), predicted.reshape(*pixels.shape[:2], -1).numpy()
+
+
+def _pause(duration: float, is_first: bool) -> float:
+    """Time from one live.npz to the next, s; the first also compiles and imports, so it says little about the others."""
+    if is_first:
+        return duration
+    return min(duration / FIELD_SHARE, max(FIELD_INTERVAL, duration / MOST_SHARE))
 
 
 def _device(field: Field) -> torch.device:
