@@ -94,7 +94,7 @@ def test_no_status_unless_requested(measurement, tmp_path):
         (0.05, 0.05, 0.013, 6),
         (0.17, 0.17, 0.013, 18),
         (0.5, 0.5, 0.03, 21),  # not more often than every 20 s, at little cost
-        (5.0, 5.0, 0.11, 56),  # as of a large field
+        (5.0, 5.0, 0.14, 56),  # as of a large field
         (2.0, 0.1, 0.03, 12),  # the first also compiles and imports
         (30.0, 0.1, 0.2, 62),
     ],

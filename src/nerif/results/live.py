@@ -221,7 +221,7 @@ class Live:
 
 
 def _pause(duration: float, is_first: bool) -> float:
-    """Time from one live.npz to the next, s; the first also compiles and imports, so it says little about the others."""
+    """Time from one live.npz to the next, s; the first also compiles and imports, so says little about the others."""
     if is_first:
         return duration
     return min(duration / FIELD_SHARE, max(FIELD_INTERVAL, duration / MOST_SHARE))
