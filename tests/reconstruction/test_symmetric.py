@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -18,7 +20,7 @@ from nerif.forward.registry import forward_models
 from nerif.geometry import Box, Grid, Lens, paper_rig
 from nerif.geometry.symmetry import Symmetry
 from nerif.reconstruction.neural.neural import NeRIF
-from nerif.reconstruction.symmetry import check_views, find_axis, symmetry_of
+from nerif.reconstruction.symmetry import check_views, find_axis, symmetry_of, too_few_views
 from nerif.reconstruction.voxels.landweber import Landweber
 from nerif.reconstruction.voxels.layout import Symmetric
 from nerif.reconstruction.voxels.multiplicative import MLEM
@@ -156,14 +158,32 @@ def test_harmonics_reduce_the_error_of_a_flow_off_the_axis(method):
     assert two < 0.4 * none
 
 
-@pytest.mark.parametrize(("text", "views", "instead"), [("axis+2", 1, "axis"), ("axis+3", 3, "axis+2")])
+@pytest.mark.parametrize(
+    ("text", "views", "instead"),
+    [("axis+2", 1, "axis"), ("axis+3", 3, "axis+1"), ("axis+2", 2, "axis"), ("axis+4", 4, "axis+1")],
+)
 def test_more_harmonics_than_views_can_determine_are_refused(text, views, instead):
-    box = Box.cube(50.0)
-    few = simulate(Bent(), paper_rig(8)[0][:views], box, 1.00027, 0.02, 0)
-    with refused("symmetry"):
+    few = SimpleNamespace(cameras=[None] * views)
+    with refused("symmetry") as error:
         check_views(NeRIF(symmetry=text), few)
-    check_views(NeRIF(symmetry=instead), few)
-    check_views(NeRIF(), few)
+    assert str(error.value).endswith(f"give --symmetry {instead}")
+    for settings in (NeRIF(symmetry=instead), NeRIF()):
+        check_views(settings, few)
+        assert not too_few_views(settings, few)
+
+
+@pytest.mark.parametrize(
+    ("text", "views", "words"),
+    [
+        ("axis+4", 5, r"5 views are too few for 4 harmonics, which need 9; .* Give --symmetry axis\+2"),
+        ("axis+1", 2, "which need 3; .* Give --symmetry axis$"),
+        ("axis+2", 4, r"Give --symmetry axis\+1"),
+        ("axis+2", 5, "^$"),
+        ("planar", 1, "^$"),
+    ],
+)
+def test_harmonics_that_the_views_do_not_determine_are_named(text, views, words):
+    assert re.search(words, too_few_views(NeRIF(symmetry=text), SimpleNamespace(cameras=[None] * views)))
 
 
 class Sheet(Field):

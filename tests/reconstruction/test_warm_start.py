@@ -14,9 +14,11 @@ import torch
 from nerif.fields.base import Field
 from nerif.fields.grid import VoxelField
 from nerif.fields.network import Network, NetworkShape, NeuralField
+from nerif.fields.symmetric import SymmetricNetwork
 from nerif.forward.deflection import MODELS
 from nerif.forward.path_integral import PathIntegral, project
 from nerif.geometry import Box, Grid
+from nerif.geometry.symmetry import Symmetry
 from nerif.reconstruction.neural.losses import MixedPrecision
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.neural.warm_start import copy_weights, fit_network
@@ -64,6 +66,20 @@ def test_a_copy_of_the_network_is_moved(field):
     assert vars(copy).keys() == vars(field).keys()
     assert bool(torch.isfinite(field(torch.rand(5, 3))).all())
     assert field.to("cpu") is field
+
+
+@pytest.mark.parametrize("text", ["axis", "axis+1", "axis+4"])
+def test_the_weights_are_copied_whatever_the_azimuth_of_the_frame(text):
+    straight = Symmetry.about(text, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), 1e-3)
+    cosine, sine = math.cos(0.7), math.sin(0.7)
+    turned = replace(straight, frame=((cosine, sine, 0.0), (-sine, cosine, 0.0), (0.0, 0.0, 1.0)))
+    aside = replace(straight, point=(0.5, 0.0, 0.0))
+    fields = [NeuralField(SymmetricNetwork(SHAPE, s), BOX, 1e-4) for s in (straight, turned, aside)]
+    points = torch.rand(60, 3) * 4 - 2
+    assert copy_weights(fields[0], fields[1])
+    for before, after in zip(*(f.value_and_gradient(points) for f in fields[:2]), strict=True):
+        torch.testing.assert_close(after, before, rtol=1e-4, atol=1e-4 * float(before.detach().abs().max()))
+    assert not copy_weights(fields[0], fields[2])
 
 
 def test_the_network_is_fitted_to_a_field_on_another_device(field):

@@ -195,10 +195,19 @@ class Symmetry:
         return replace(self, point=(x, y, z), frame=tuple((a, b, c) for a, b, c in rows))
 
     def near(self, other: Symmetry, tolerance: float) -> bool:
-        """Return whether another symmetry has the same kind, and p and frame within this tolerance."""
-        mine, others = ((*s.point, *(x for row in s.frame for x in row)) for s in (self, other))
+        """Return whether another symmetry has the same kind, and p and frame (of an axis e3) within a tolerance."""
+        rows = slice(2, 3) if self.axial else slice(3)
+        mine, others = ((*s.point, *(x for row in s.frame[rows] for x in row)) for s in (self, other))
         same = (self.kind, self.harmonics) == (other.kind, other.harmonics)
         return same and all(abs(a - b) <= tolerance for a, b in zip(mine, others, strict=True))
+
+    def mixing(self, other: Symmetry) -> Float[Tensor, "k k"]:
+        """Return the matrix that makes f_k of this frame from those of another frame with nearly the same axis."""
+        turn = torch.atan2(self.matrix[0] @ other.matrix[1], self.matrix[0] @ other.matrix[0])
+        angle = 2 * math.pi * torch.arange(self.angles, dtype=torch.float64) / self.angles
+        orders = torch.arange(1, self.harmonics + 1, dtype=torch.float64)
+        waves = (orders * (angle[:, None] + turn - angle)[..., None]).cos().sum(-1)
+        return (1 + 2 * waves) / self.angles
 
     def in_units(self, centre: tuple[float, float, float], unit: float) -> Symmetry:
         """Return the symmetry in coordinates (x - centre) / unit."""

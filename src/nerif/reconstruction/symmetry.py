@@ -33,7 +33,7 @@ from nerif.reconstruction.voxels.levels import bins_of
 from nerif.reconstruction.voxels.problem import Penalty, Problem
 from nerif.reconstruction.voxels.symmetric_operator import SymmetricOperator
 
-__all__ = ["axis_of", "check_views", "find_axis", "symmetry_of", "with_axis"]
+__all__ = ["axis_of", "check_views", "find_axis", "symmetry_of", "too_few_views", "with_axis"]
 
 VOXELS = 40  # along the longest edge of the box
 MAX_RAYS = 6000
@@ -156,12 +156,27 @@ def check_views(settings: SharedSettings, measurement: Measurement) -> None:
     """
     parsed, views = parse_symmetry(settings.symmetry), len(measurement.cameras)
     if parsed is not None and parsed[1] >= views:
-        largest = "axis" if views == 1 else f"axis+{views - 1}"
         raise InputError(
             f"expected {parsed[1] + 1} views or more for {settings.symmetry}, better {2 * parsed[1] + 1}, "
-            f"got {views}; give --symmetry {largest}",
+            f"got {views}; give --symmetry {_determined(views)}",
             field="symmetry",
         )
+
+
+def too_few_views(settings: SharedSettings, measurement: Measurement) -> str:
+    """Return a line on harmonics that the views do not determine; empty if they determine all."""
+    parsed, views = parse_symmetry(settings.symmetry), len(measurement.cameras)
+    if parsed is None or views > 2 * parsed[1]:
+        return ""
+    return (
+        f"--symmetry {settings.symmetry}: {views} views are too few for {parsed[1]} harmonics, which need "
+        f"{2 * parsed[1] + 1}; the regularisation determines the rest. Give --symmetry {_determined(views)}"
+    )
+
+
+def _determined(views: int) -> str:
+    """Return the symmetry with the most harmonics that so many views determine."""
+    return f"axis+{(views - 1) // 2}" if views > 2 else "axis"
 
 
 def axis_of(settings: SharedSettings, measurement: Measurement) -> Axis | None:

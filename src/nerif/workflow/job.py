@@ -35,7 +35,7 @@ from nerif.reconstruction.progress import QUIET, Monitor
 from nerif.reconstruction.rig.posterior import RigPosterior
 from nerif.reconstruction.shared_settings import SharedSettings
 from nerif.reconstruction.sources import check_source
-from nerif.reconstruction.symmetry import axis_of, with_axis
+from nerif.reconstruction.symmetry import axis_of, too_few_views, with_axis
 from nerif.reconstruction.uncertainty.bootstrap import KINDS, Trials
 from nerif.results.directory import ResultDirectory
 from nerif.results.live import Live
@@ -105,7 +105,7 @@ class Inputs:
     gains : intensity gains by view
     path : of the measurement; None for one in memory
     box : of the result; that of the data may be larger (grow)
-    note : line on a setting that the data limit, if one is
+    notes : lines on settings that the data limit
     """
 
     all_views: Measurement
@@ -115,7 +115,7 @@ class Inputs:
     gains: dict[str, float]
     path: Path | None
     box: Box
-    note: str = ""
+    notes: tuple[str, ...] = ()
 
     @classmethod
     def of(
@@ -136,12 +136,14 @@ class Inputs:
         if gains:
             measurement, training = with_gains(measurement, gains), with_gains(training, gains)
         reconstructor, note = reconstructor.resolved(training)
-        return cls(all_views, measurement, training, withheld, gains, path, box, note), reconstructor
+        few = too_few_views(reconstructor, training) if isinstance(reconstructor, SharedSettings) else ""
+        notes = tuple(line for line in (note, few) if line)
+        return cls(all_views, measurement, training, withheld, gains, path, box, notes), reconstructor
 
     @property
     def remarks(self) -> list[str]:
         """Lines on changed settings, intensity gains and pixels that are left out."""
-        lines = [self.note] if self.note else []
+        lines = [*self.notes]
         if self.gains:
             lines.append("intensity gains: " + ", ".join(f"{name} {gain:.4f}" for name, gain in self.gains.items()))
         if self.measurement.bad_pixels:

@@ -141,9 +141,10 @@ def progress_bar(title: str) -> Iterator[OnStep]:
     with figures_bar(title) as bar:
 
         def update(step: Step) -> None:
-            remaining = step.seconds * (1 / step.progress - 1) if step.progress > 0.001 else float("nan")
             terms = " ".join(f"{k} {v:.3g}" for k, v in step.losses.items())
-            figures = f"epoch {step.epoch:.1f} | {terms} | {step.rays_per_second:.3g} rays/s | {remaining:.0f} s left"
+            figures = f"epoch {step.epoch:.1f} | {terms} | {step.rays_per_second:.3g} rays/s"
+            if step.progress > 0.001:  # else unknown
+                figures += f" | {step.seconds * (1 / step.progress - 1):.0f} s left"
             bar(step.progress, figures, step.seconds)
 
         yield update

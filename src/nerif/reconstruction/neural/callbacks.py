@@ -41,6 +41,7 @@ __all__ = [
 MAX_ROLLBACKS = 5
 PACE_FROM = 0.1  # share of the run after which its pace is known
 LOG_EVERY, SAVE_EVERY = 20, 200  # steps
+FIT_PACE_STEP = 10  # of a fit to the initial field, after which its pace is known
 LOG_SECONDS = 5.0  # after which a record is due as well, so that slow steps have a history
 NUISANCE_SAMPLES = 24  # per ray
 RIG_SAMPLES, RIG_LENS_RAYS, RIG_BATCH = 16, 4, 512  # samples of a thin ray, rays through a lens, pixels
@@ -349,6 +350,9 @@ class WarmStart(Callback):
     def _report(trainer: Trainer, step: int, loss: float) -> bool:
         """Report a step of the fit; return whether to stop."""
         schedule, values = trainer.schedule, {"fit_step": float(step), "fit_loss": loss}
+        if step == FIT_PACE_STEP:
+            seconds = schedule.seconds / step * trainer.settings.fit_steps
+            trainer.progress.notes.append(f"first the network is fitted to the initial field: about {seconds:.0f} s")
         if trainer.history.due(trainer, step):
             trainer.history.log(trainer, values)
         synchronise(trainer)

@@ -35,12 +35,21 @@ def copy_weights(start: Field, field: NeuralField) -> bool:
     if start.network.shape != field.network.shape or start.box != field.box:
         return False
     before, now = (f.network.symmetry if isinstance(f.network, SymmetricNetwork) else None for f in (start, field))
-    if before is not None and now is not None and not now.near(before, AXIS_TOLERANCE):
-        return False
+    mixing = None
+    if before is not None and now is not None:
+        if not now.near(before, AXIS_TOLERANCE):
+            return False
+        mixing = now.mixing(before).float() if now.harmonics else None
     bounded = (start.network.limits, field.network.limits) != (UNBOUNDED, UNBOUNDED)
     if bounded and start.bounds != field.bounds:
         return False
     field.network.load_state_dict(start.network.state_dict())
+    if mixing is not None:  # the azimuths a_k count from e1, which depends on the views
+        output = field.network.outputs[0]
+        assert isinstance(output, nn.Linear)
+        with torch.no_grad():
+            for values in (output.weight, output.bias):
+                values.copy_(mixing.to(values) @ values)
     if bounded:  # bounds bend nearby values in units of the scale, so the scale is copied as well
         field.scale, field.offset = start.scale, start.offset
         return True
