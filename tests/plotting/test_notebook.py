@@ -118,7 +118,7 @@ def test_a_reconstruction_shows_its_field_and_why_it_stopped(measurement: Measur
     settings: dict[str, Any] = {"voxels": 10, "regularisation": 0.01}
     result = Tikhonov(**settings)(measurement)
     shown = Panel(result._repr_html_())
-    assert shown.cells[shown.cells.index("Outcome") + 1].startswith(result.outcome.reason)
+    assert shown.cells[shown.cells.index("Why it ended") + 1] == result.outcome.sentence
     misfit = shown.cells[shown.cells.index("Misfit") + 1]
     assert float(misfit.split()[0]) == pytest.approx(result.history[-1]["residual_over_sigma"], rel=0.01)
     assert "times the noise" in misfit

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import subprocess
 import sys
+import time
 from contextlib import nullcontext
 from dataclasses import replace
 
@@ -109,6 +111,21 @@ def test_a_second_run_into_the_directory_is_refused_and_leaves_the_first_alone(m
     assert not result.missing
     assert result.settings["method"] == "tikhonov"
     assert not list(out.glob(".*"))
+
+
+@pytest.mark.parametrize("resume", [False, True])
+def test_the_time_of_the_fit_and_of_the_whole_are_printed_at_the_end(measurement, tmp_path, resume):
+    lines: list[str] = []
+    out, since = tmp_path / "r", time.time() - 500
+    if resume:
+        reconstruct_into(out, measurement, QUICK, RUN)
+    result = reconstruct_into(out, measurement, QUICK, RUN, resume=resume, monitor=Monitor(lines.append), since=since)
+    times = r"(\d+) s for the fit on cpu, (\d+) s (.*)"
+    match = re.fullmatch(f"{out}: {times}; open {out / 'volume.vti'} in ParaView", lines[-1])
+    assert match is not None
+    assert int(match[1]) == round(result.seconds)
+    assert int(match[2]) >= 500
+    assert match[3] == ("since it was resumed" if resume else "in all")
 
 
 def test_a_report_that_fails_does_not_end_a_run(measurement, tmp_path, monkeypatch):

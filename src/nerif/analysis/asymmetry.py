@@ -18,7 +18,7 @@ import torch.nn.functional as functional
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from nerif.common.conventions import InputError
+from nerif.common.conventions import InputError, percent
 from nerif.data.measurement import Measurement, Observation
 from nerif.geometry import Camera
 from nerif.geometry.symmetry import Symmetry
@@ -141,7 +141,7 @@ def asymmetry(measurement: Measurement, symmetry: Symmetry) -> list[dict[str, An
 def asymmetry_sentence(row: Mapping[str, Any]) -> str:
     """Return one row of `asymmetry` in words."""
     cc = ", ".join(f"{name} {value:.3f}" for name, value in row["cc"].items())
-    share = f"{row['antisymmetry']:.0%} of the signal is antisymmetric"
+    share = f"{percent(row['antisymmetry'], 0)} of the signal is antisymmetric"
     return f"{row['name']}: the halves of the {row['measured']} correlate by {cc}; {share}"
 
 

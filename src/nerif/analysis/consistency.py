@@ -408,8 +408,9 @@ def _vectors_of(image: Transform, u: float, v: float) -> Transform:
 MIRRORED, UPSIDE_DOWN = "the image is mirrored left to right", "the image is upside down, mirrored top to bottom"
 TURNED, QUARTER = "the image is turned by 180 degrees", "the image is turned by 90 degrees"
 TRANSPOSED = "the image is transposed (rows and columns exchanged)"
-SORTED = "images and cameras were sorted differently, one by numbers (2, 10), the other by letters (10, 2)"
-REVERSED = "images and cameras are in opposite order"
+BY_NUMBER = "the images fit better in numerical order (2 before 10); check file names"
+BY_LETTER = "the images fit better in alphabetical order (10 before 2); check file names"
+REVERSED = "the images fit better in the opposite order; check file names"
 
 OF_VECTORS = (
     Change("swapped", "u and v are swapped", lambda d: d.flip(-1), "u and v are swapped"),
@@ -517,7 +518,7 @@ def orders(cameras: Sequence[Camera]) -> list[Correction]:
     by_number = sorted(every, key=lambda i: [float(word) for word in re.findall(r"\d+(?:\.\d+)?", names[i])])
     by_letter = sorted(every, key=lambda i: names[i])
     there, back = dict(zip(by_number, by_letter, strict=True)), dict(zip(by_letter, by_number, strict=True))
-    words = {tuple(there[i] for i in every): SORTED, tuple(back[i] for i in every): SORTED, every[::-1]: REVERSED}
+    words = {tuple(there[i] for i in every): BY_NUMBER, tuple(back[i] for i in every): BY_LETTER, every[::-1]: REVERSED}
     words.pop(every, None)
     return [
         Correction(every, "reordered", text, None, order)

@@ -30,6 +30,7 @@ from dataclasses import dataclass
 
 from nerif.analysis.asymmetry import camera_of
 from nerif.analysis.remedies import DEVIATIONS, WITHHOLD, advice, is_fitted, likely_cause, longer
+from nerif.common.conventions import percent
 from nerif.data.volume import field_of
 from nerif.forward.registry import TECHNIQUES
 from nerif.results.directory import Result
@@ -94,7 +95,7 @@ class Estimate:
         weights = [math.log(e.high / e.error) ** -2 for e in (self, other)]
         total = sum(weights)
         mean = sum(w * math.log(e.error) for w, e in zip(weights, (self, other), strict=True)) / total
-        return Estimate.within(math.exp(mean), math.exp(total**-0.5), f"{self.basis} and {other.basis}")
+        return Estimate.within(math.exp(mean), math.exp(total**-0.5), f"{self.basis}, and {other.basis}")
 
 
 @dataclass(frozen=True)
@@ -130,7 +131,8 @@ class Verdict:
         if self.error is None:
             return f"{head}{self.reasons}."
         span = "" if self.low is None or self.high is None else f" ({_percent(self.low)} to {_percent(self.high)})"
-        return f"{head}estimated relative error of the variation {_percent(self.error)}{span}, {self.reasons}."
+        error = f"the field is wrong by about {_percent(self.error)} of its difference from the ambient (rms)"
+        return f"{head}{error}{span}, {self.reasons}."
 
 
 def verdict(result: Result) -> Verdict:
@@ -149,7 +151,7 @@ def verdict(result: Result) -> Verdict:
     estimate, unavailable = _from_views(result, withheld, fitted)
     deviation = _deviation(result)
     if deviation is not None:
-        other = Estimate.within(deviation, DEVIATIONS_FACTOR, "from its standard deviations")
+        other = Estimate.within(deviation, DEVIATIONS_FACTOR, "estimated from its standard deviations")
         estimate = other if estimate is None else estimate.mean(other)
     doubt, severe = _contradiction(fitted, result, estimate)
     symmetry = metrics.axis["symmetry"] if metrics.axis else {}
@@ -248,8 +250,8 @@ def _from_views(
     )
     noise = _noise(fitted)
     for views, basis in (
-        (withheld, "cross-validated on a withheld view"),
-        (first_views, "cross-validated in a first run without a view"),
+        (withheld, "left out of the run"),
+        (first_views, "left out of a short first run"),
     ):
         usable = [v for v in views if v["measured"] in noise and v["measured"] in _quantities(views)]
         if not usable:
@@ -267,7 +269,9 @@ def _from_views(
         error = math.hypot(factor * largest, B_MISFIT * misfit, C_NOISE * noisy)
         if not math.isfinite(error):
             return None, "the signal of a view is below the noise"
-        return Estimate.within(error, VIEWS_FACTOR, basis), ""
+        names = list(dict.fromkeys(v["name"] for v in usable))
+        whose = f"view {names[0]}" if len(names) == 1 else f"{len(names)} views"
+        return Estimate.within(error, VIEWS_FACTOR, f"estimated by predicting {whose}, {basis}"), ""
     return None, ""
 
 
@@ -349,7 +353,7 @@ def _contradiction(fitted: Sequence[View], result: Result, estimate: Estimate | 
             if severe and is_fitted(cause, result.settings):
                 cause, severe = "", estimate is None or part > estimate.high
             likely = likely_cause(cause, result)
-            return f"{views} spatially correlated ({worst}: {part:.1%} of the signal), as with {likely}", severe
+            return f"{views} spatially correlated ({worst}: {percent(part)} of the signal), as with {likely}", severe
         shares = {v["name"]: v["rms"] / v["rms_predicted"] for v in group}
         worst, median = max(shares, key=lambda k: shares[k]), statistics.median(shares.values())
         if median > 0 and shares[worst] > UNEVEN * median:

@@ -14,6 +14,7 @@ from nerif.analysis.verdict import verdict
 from nerif.app.project import Contents, Project
 from nerif.common.conventions import InputError
 from nerif.data.velocity_sequence import VelocitySequence, open_volumes
+from nerif.reconstruction.base import END
 from nerif.reconstruction.files import FIELD
 from nerif.report.movie import finished_frames
 from nerif.report.summary import accuracy_rows
@@ -22,7 +23,7 @@ from nerif.results.metrics import Metrics
 
 __all__ = ["Row", "result_table", "rows_of"]
 
-HEAD = ("Name", "Method", "Verdict", "Estimated error", "Views, worst rms", "Outcome", "Time", "Ended")
+HEAD = ("Name", "Method", "Verdict", "Estimated error", "Views, worst rms", "Why it ended", "Time of the fit", "Ended")
 CLASSES = {"use": "good", "use with care": "care", "do not use": "bad"}
 
 
@@ -67,14 +68,14 @@ def _of(name: str, title: str, result: Result) -> Row:
     judgement, metrics = verdict(result), result.metrics
     views = [v for v in metrics.views if math.isfinite(v["rms"])]
     worst = rms_with_unit(max(views, key=lambda v: v["rms"]), 3) if views else ""
-    outcome = str(metrics.outcome or result.about.get("outcome") or "not ended").replace("_", " ")
+    outcome = str(metrics.outcome or result.about.get("outcome") or "not ended")
     seconds = metrics.seconds if metrics.seconds is not None else result.about.get("seconds")
     error = "" if judgement.error is None else f"{judgement.error:.1%} of the variation"
     ended, word, sentence = metrics != Metrics(), judgement.rating, judgement.sentence
     if not ended:
         word, sentence = "", " ".join(gap.sentence for gap in result.missing) or "No data yet."
     time = "" if seconds is None else f"{float(seconds):.0f} s"
-    cells = (result.method, word, error, worst, outcome, time, str(result.about.get("finished", "")))
+    cells = (result.method, word, error, worst, END.get(outcome, outcome), time, str(result.about.get("finished", "")))
     return Row(name, title, cells, word, sentence, tuple(accuracy_rows(result)) if ended else ())
 
 

@@ -21,6 +21,7 @@ __all__ = [
     "ambient_index",
     "check_name",
     "parse_faces",
+    "percent",
     "printable",
     "unit_shown",
     "whole",
@@ -111,9 +112,15 @@ def whole(value: object, name: str) -> int:
     return int(number)
 
 
+def percent(share: float, digits: int = 1) -> str:
+    """Return a fraction in per cent; a small one as under 0.1 %, not 0."""
+    least = 10.0 ** -(digits + 2)
+    return f"under {least:.{digits}%}" if 0 < share < least / 2 else f"{share:.{digits}%}"
+
+
 def unit_shown(unit: str) -> str:
-    """Return the unit as printed; empty for the unit 1."""
-    return "" if unit == "1" else unit
+    """Return the unit as printed, a noun in the plural; empty for the unit 1."""
+    return {"1": "", "grey value": "grey values"}.get(unit, unit)
 
 
 def with_unit(value: object, unit: str) -> str:

@@ -49,8 +49,8 @@ def _lenses(measurement: Measurement) -> list[tuple[str, str]]:
 
 
 def _sizes(measurement: Measurement, observation: Observation) -> list[tuple[str, str]]:
-    """Return the sizes of values and noise of a technique."""
-    kind, usable = observation.technique, measurement.usable_for(observation)
+    """Return the sizes of values and noise of a technique, of rays that cross the box."""
+    kind, usable = observation.technique, measurement.usable_for(observation) & measurement.sees_box
     squares, noise, largest = 0.0, 0.0, 0.0
     for i, mask in enumerate(usable):  # view by view: images may be large
         values = observation.values[i][mask].double()

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from nerif.common.conventions import percent
 from nerif.imaging.displacement.noise import local_correlation
 from nerif.imaging.readers.exposure import saturated
 from nerif.imaging.readers.views import Images, View
@@ -107,7 +108,7 @@ def _overexposed(shares: Sequence[float]) -> dict[int, str]:
     for i, share in enumerate(shares):
         others = float(np.median([*shares[:i], *shares[i + 1 :]])) if len(shares) > 1 else share
         if share > max(least, ratio * others):
-            reasons[i] = f"{share:.1%} of the pixels are over-exposed, {others:.1%} in the other references"
+            reasons[i] = f"{percent(share)} of the pixels are over-exposed, {percent(others)} in the other references"
     return reasons
 
 

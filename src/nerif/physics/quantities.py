@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nerif.common.conventions import InputError
+from nerif.common.conventions import InputError, percent
 from nerif.data.volume import QUANTITIES, Volume, quantities_of
 from nerif.physics.gas_optics import density_from_index, gladstone_dale, molar_mass, temperature_from_density
 
@@ -173,6 +173,6 @@ def masked_lines(volumes: list[Volume]) -> list[str]:
     for v in volumes:
         count = int(v.notes.get("masked_voxels", 0))
         if count:
-            share = f"{count} of {v.values.numel()} voxels ({count / v.values.numel():.2%})"
+            share = f"{count} of {v.values.numel()} voxels ({percent(count / v.values.numel(), 2)})"
             lines.append(f"{v.quantity}: {share} are NaN: {v.notes['masked_where']}")
     return lines

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float
 
-from nerif.common.conventions import with_unit
+from nerif.common.conventions import percent, with_unit
 from nerif.plotting.drawing import (
     Drawable,
     add_colour_bar,
@@ -28,7 +28,7 @@ from nerif.plotting.drawing import (
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["figure_of_slices", "image", "number", "panel", "percent", "show_slices", "show_views", "span"]
+__all__ = ["figure_of_slices", "image", "number", "panel", "show_slices", "show_views", "span"]
 
 SLICES = (8.5, 2.8)  # inches
 VIEWS = 9  # to draw at most, evenly spaced
@@ -46,18 +46,13 @@ def number(value: object, digits: int = 4) -> str:
     return f"{float(mantissa):g} × 10{raised}"
 
 
-def percent(share: float) -> str:
-    """Return a fraction in per cent; a small one as under 0.01 %, not 0."""
-    return "under 0.01%" if 0 < share < 1e-4 else f"{share:.2%}"
-
-
 def span(values: Float[np.ndarray, ...], unit: str = "1", digits: int = 3) -> str:
     """Return lowest and highest value with their unit, and the masked fraction (NaN)."""
     finite = values[np.isfinite(values)]
     if not finite.size:
         return "masked everywhere"
     share = 1 - finite.size / values.size
-    masked = f"; {percent(share)} masked" if share else ""
+    masked = f"; {percent(share, 2)} masked" if share else ""
     low, high = (number(float(x), digits) for x in (finite.min(), finite.max()))
     return f"{with_unit(f'{low} to {high}', unit)}{masked}"
 

@@ -27,7 +27,9 @@ if TYPE_CHECKING:
     import xarray as xr
     from matplotlib.figure import Figure
 
-__all__ = ["VOXELS", "OnStep", "Outcome", "Reconstruction", "Reconstructor", "State", "Step", "compose", "sampled"]
+__all__ = [
+    "END", "VOXELS", "OnStep", "Outcome", "Reconstruction", "Reconstructor", "State", "Step", "compose", "sampled",
+]  # fmt: skip
 
 VOXELS = 100  # of a volume along the longest edge
 NOTEBOOK_VOXELS = 48  # along the longest edge
@@ -38,13 +40,18 @@ MISFITS = {  # columns of a history, the most informative first
 }
 
 
+END = {
+    "converged": "converged", "discrepancy": "residual as large as the noise", "epochs": "all epochs done",
+    "steps": "all steps done", "iterations": "all iterations done", "time_limit": "time limit reached",
+    "interrupted": "interrupted", "diverged": "diverged", "collapsed": "no field found",
+}  # fmt: skip
+"""Reasons why a reconstruction stopped, in words."""
+FAILED = ("diverged", "collapsed")
+
+
 @dataclass(frozen=True)
 class Outcome:
-    """Why a reconstruction stopped: a word, and a sentence with the remedy if there is one.
-
-    The reason is converged, discrepancy, epochs, steps, iterations, time_limit, interrupted, diverged or collapsed (to
-    the ambient field).
-    """
+    """Why a reconstruction stopped: a reason (one of END), and a sentence with the remedy if there is one."""
 
     reason: str
     message: str
@@ -52,7 +59,12 @@ class Outcome:
     @property
     def failed(self) -> bool:
         """Whether there is no useful field."""
-        return self.reason in ("diverged", "collapsed")
+        return self.reason in FAILED
+
+    @property
+    def sentence(self) -> str:
+        """The message, after the reason in words unless the message has it."""
+        return f"{END[self.reason]}: {self.message}" if self.reason in ("converged", *FAILED) else self.message
 
 
 @dataclass(frozen=True)
@@ -175,7 +187,7 @@ class Reconstruction:
         from nerif.plotting.notebook import number, panel, show_slices
 
         volume = self.volume(NOTEBOOK_VOXELS)
-        rows = [("Outcome", f"{self.outcome.reason.replace('_', ' ')}: {self.outcome.message}")]
+        rows = [("Why it ended", self.outcome.sentence)]
         rows.append(("Time", f"{self.seconds:.0f} s on {self.device}"))
         last = self.history[-1] if self.history else {}
         misfits = [("Misfit", f"{number(last[name], 3)} {text}") for name, text in MISFITS.items() if name in last]

@@ -12,12 +12,13 @@ import numpy as np
 from nerif.analysis.evaluation import rms_with_unit
 from nerif.analysis.remedies import WITHHOLD, Remedy, advice, likely_cause, longer
 from nerif.analysis.verdict import correlated_share, time_of_fit, verdict
-from nerif.common.conventions import with_unit
+from nerif.common.conventions import percent, with_unit
 from nerif.data.volume import INDEX, field_of, name_of
 from nerif.forward.registry import TECHNIQUES
 from nerif.physics.quantities import TEMPERATURE_RANGE
 from nerif.plotting.drawing import LABELS, plotted_quantities, plotted_values
-from nerif.plotting.notebook import number, percent, span
+from nerif.plotting.notebook import number, span
+from nerif.reconstruction.base import END
 from nerif.reconstruction.files import FIELD
 from nerif.reconstruction.rig.parameters import refinement_lines
 from nerif.report.packing import relation
@@ -81,7 +82,7 @@ def field_rows(result: Result) -> Rows:
     if result.metrics.seconds is not None:
         memory = result.metrics.peak_memory_bytes
         gib = f", {memory / 2**30:.2f} GiB" if memory else ""
-        rows.append(("Time", f"{result.metrics.seconds:.0f} s on {result.metrics.device or '?'}{gib}"))
+        rows.append(("Time of the fit", f"{result.metrics.seconds:.0f} s on {result.metrics.device or '?'}{gib}"))
     return rows
 
 
@@ -118,7 +119,7 @@ def accuracy_rows(result: Result) -> Rows:
         before, after = (max(row[name] for row in rig) for name in ("rms_before", "rms_after"))
         rows.append(("Worst view, before and after refinement", f"rms {before:.2f} σ, {after:.2f} σ"))
     if metrics.outcome is not None:
-        rows.append(("Outcome", metrics.outcome.replace("_", " ")))
+        rows.append(("Why it ended", END.get(metrics.outcome, metrics.outcome)))
     if metrics.l2 is not None and metrics.l2_variation is not None:
         errors = f"L2 {metrics.l2:.2%}"
         if field_of(result.volumes) in (None, INDEX):  # the paper's L2 includes the ambient
@@ -279,7 +280,8 @@ def _of_correlated_residuals(result: Result) -> list[Statement]:
         verb = f"Residuals of {len(group)} training views ({names}) are"
         verb = verb if len(group) > 1 else f"The residual of training view {names} is"
         where = f"row {worst['residual_test']['row']:.0f}, column {worst['residual_test']['column']:.0f}"
-        text = f"{verb} spatially correlated, up to {share:.1%} of the signal in {_place(worst, views)} around {where}."
+        size = f"up to {percent(share)} of the signal"
+        text = f"{verb} spatially correlated, {size} in {_place(worst, views)} around {where}."
         text += f" Likely cause: {likely_cause(cause, result)}."
         remarks.append(Statement("warning" if share > CORRELATED else "note", text))
     return remarks
@@ -331,6 +333,6 @@ def _of_masks(result: Result) -> list[Statement]:
         share = count / volume.values.numel()
         voxels = "voxel" if count == 1 else "voxels"
         where = volume.notes.get("masked_where")
-        text = f"{quantity.capitalize()} is masked in {count} {voxels} ({percent(share)}): {where}."
+        text = f"{quantity.capitalize()} is masked in {count} {voxels} ({percent(share, 2)}): {where}."
         remarks.append(Statement("note" if share < 0.05 else "warning", text))
     return remarks

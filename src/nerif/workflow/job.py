@@ -14,7 +14,7 @@ from annotated_types import Ge
 from nerif.analysis.asymmetry import halved
 from nerif.analysis.gains import fit_gains, with_gains
 from nerif.analysis.prediction import check_sees
-from nerif.common.conventions import InputError
+from nerif.common.conventions import InputError, percent
 from nerif.common.installation import command_line, word_of
 from nerif.common.memory import free_memory
 from nerif.common.settings import NonNegative, check_settings
@@ -153,8 +153,8 @@ class Inputs:
         for camera in self.measurement.cameras:
             if camera.unseen:
                 lines.append(
-                    f"view '{camera.name}': {camera.unseen:.1%} of the pixels left out, where its distortion is not "
-                    "invertible; calibrate it with target images that cover its corners"
+                    f"view '{camera.name}': {percent(camera.unseen)} of the pixels left out, where its distortion is "
+                    "not invertible; calibrate it with target images that cover its corners"
                 )
         return lines
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Mapping
 from contextlib import nullcontext
 from typing import Any
@@ -83,3 +84,7 @@ def run_steps(job: Job) -> None:
         for step in CLOSING:
             if step.wanted(job):
                 step.run(job)
+    result, volume = the_result(job), job.out / "volume.vti"
+    fit, whole = f"{result.seconds:.0f} s for the fit on {result.device}", f"{time.time() - job.budget.start:.0f} s"
+    since = "since it was resumed" if job.resume else "in all"
+    job.monitor.say(f"{job.out.path}: {fit}, {whole} {since}; open {volume} in ParaView")

@@ -212,7 +212,7 @@ class WriteField(PipelineStep):
         job.begin()
         out.write_field(result)
         out.write_history(result.history)
-        say(f"{result.outcome.reason}: {result.outcome.message}")
+        say(result.outcome.sentence)
         with job.monitor.counting("sampling the field"):
             volumes = job.quantities = all_quantities(result, job.run.gas, job.voxels)
             out.write_volumes(volumes)
@@ -302,8 +302,6 @@ class Reproject(PipelineStep):
             out.write_reprojection(reprojection)
         for line in (*score_lines(views), *(accuracy.sentence for accuracy in reprojection.accuracies)):
             monitor.say(line)
-        seconds, volume = f"{result.seconds:.0f} s on {result.device}", out / "volume.vti"
-        monitor.say(f"{out.path}: result of {seconds}; open {volume} in ParaView")
 
 
 class WriteAxis(PipelineStep):

@@ -64,7 +64,7 @@ class Calibrate(Settings):
     upper: tuple[float, float, float] | None = None
     """Upper corner x y z of the box, mm."""
     force: bool = False
-    """Overwrite existing files."""
+    """Overwrite an existing calibration; its figures are always replaced."""
 
 
 def run(settings: Calibrate) -> None:
@@ -78,12 +78,12 @@ def run(settings: Calibrate) -> None:
         )
     out, rig, errors = settings.out, settings.out.with_suffix(".rig.png"), settings.out.with_suffix(".errors.png")
     if settings.check:
-        check_output(out, True, endings=(".toml",))
-        check_output(rig, settings.force)
+        check_output(out, True, rig, endings=(".toml",))
         _draw(rig, *_cameras(settings, box))
         return
     no_images = settings.simple or is_calibration(settings.source)
-    check_output(out, settings.force, rig, *([] if no_images else [errors]), endings=(".toml",))
+    check_output(out, settings.force, endings=(".toml",))
+    check_output(rig, True, errors)
     if settings.simple:
         camera, box = _simple(settings, box)
         write_cameras(out, [camera], {"source": str(settings.source), "simple": settings.rig.entries}, box)

@@ -14,7 +14,7 @@ from torch import Tensor
 from nerif.analysis.evaluation import rms_with_unit
 from nerif.cli.commands.output import say
 from nerif.cli.commands.settings import Settings, command
-from nerif.common.conventions import with_unit
+from nerif.common.conventions import percent, with_unit
 from nerif.data.kinds import MEASUREMENT, RESULT, SEQUENCE, VOLUME, check_kind, kind_of
 from nerif.data.measurement import Measurement
 from nerif.data.measurement_sequence import MeasurementSequence
@@ -78,7 +78,7 @@ def _measurement(path: Path, m: Measurement) -> None:
     say(f"  masked         {m.bad_pixels} pixels with NaN, infinite or impossible value or sigma")
     for camera in m.cameras:
         if camera.unseen:
-            say(f"  distortion     not invertible for {camera.unseen:.1%} of the pixels of '{camera.name}'")
+            say(f"  distortion     not invertible for {percent(camera.unseen)} of the pixels of '{camera.name}'")
     tilt = math.degrees(max(float(c.tilt.abs().max()) for c in m.cameras))
     if tilt:
         say(f"  sensor tilt    {tilt:.3g} deg or less (Scheimpflug)")
@@ -102,7 +102,7 @@ def _measurement(path: Path, m: Measurement) -> None:
     say(f"  valid pixels   {valid_pixels(m)}")
     columns = "".join(f"{f'valid {o.technique.data_name()}':>20}{f'rms {o.label}':>24}" for o in m.observations)
     say(f"  view            size [px]  pixel [mm]   centre to camera [mm]   to background [mm]{columns}")
-    masks, shares = [m.usable_for(o) for o in m.observations], [m.valid_share(o) for o in m.observations]
+    masks, shares = [m.usable_for(o) & m.sees_box for o in m.observations], [m.valid_share(o) for o in m.observations]
     for i, c in enumerate(m.cameras):
         centre = c.centre.new_tensor(m.box.centre)
         distance, pixel, plane = float(c.distance(centre)), float(c.pixel_size(centre)), c.background

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool
 
+from nerif.common.conventions import percent
 from nerif.imaging.readers.frames import Frames, as_float
 
 __all__ = ["check_exposure", "effective_bits", "full_scale", "saturated"]
@@ -79,8 +80,9 @@ def check_exposure(image: np.ndarray, full: float, name: str, limit: float = 0.0
     """Return a warning if more than the share `limit` of an image is over-exposed, or it is nearly black."""
     share = float(np.mean(saturated(image, full) | (as_float(image) >= full)))
     if share > limit:
-        return f"{name}: {share:.1%} of the pixels are over-exposed (full scale {full:g}); lower the exposure"
+        return f"{name}: {percent(share)} of the pixels are over-exposed (full scale {full:g}); lower the exposure"
     top = float(np.percentile(image.astype(np.float64), 99.9))  # ignores a few hot pixels
     if top < 0.02 * full:
-        return f"{name}: nearly black, {top / full:.1%} of the range is used (full scale {full:g}); raise the exposure"
+        used = f"{percent(top / full)} of the range is used"
+        return f"{name}: nearly black, {used} (full scale {full:g}); raise the exposure"
     return None

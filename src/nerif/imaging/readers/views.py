@@ -218,8 +218,8 @@ def _find(folder: Path, only: Sequence[str], frame_offsets: Mapping[str, int]) -
     views = _from_file(file) if file.is_file() else _from_folders(folder)
     if not views:
         raise InputError(
-            f"no view found; expected folders such as {folder.name}/cam1/reference and "
-            f"{folder.name}/cam1/flow, or a file views.toml",
+            f"no view found; expected folders such as {folder / 'cam1' / 'reference'} and "
+            f"{folder / 'cam1' / 'flow'}, or a file views.toml",
             field=folder,
         )
     names = [v.name for v in views]

@@ -38,6 +38,7 @@ __all__ = [
     "RigRefinement", "Stages", "Synchronise", "WarmStart",
 ]  # fmt: skip
 
+INCOMPARABLE = "; loss values before and after cannot be compared"
 MAX_ROLLBACKS = 5
 PACE_FROM = 0.1  # share of the run after which its pace is known
 LOG_EVERY, SAVE_EVERY = 20, 200  # steps
@@ -454,7 +455,7 @@ class Bins(Callback):
         self.final = True
         if edge < self.edge:
             bins = "single pixels" if edge == 1 else f"bins of {edge} px"
-            trainer.progress.notes.append(f"the loss changes from bins of {self.edge} px to {bins} and may jump")
+            trainer.progress.notes.append(f"now fitting {bins}{INCOMPARABLE}")
             self.edge = edge
             trainer.data.set_bins(edge)
             trainer.set_data(new_stage=False)
@@ -481,7 +482,7 @@ class Stages(Callback):
         if trainer.schedule.done or not data.advance(trainer.schedule.progress):
             return
         if data.label != label:
-            trainer.progress.notes.append(f"the loss changes from {label} to {data.label} and jumps")
+            trainer.progress.notes.append(f"now fitting {data.label}{INCOMPARABLE}")
         trainer.set_data(new_stage=True)
         fit_nuisance(trainer)
         trainer.history.log(trainer, {"part": float(data.stage)})
