@@ -10,6 +10,7 @@ import torch
 
 from bodies import cuboid
 from nerif.app.project import Contents, Project
+from nerif.cli.arguments import INPUTS, check_arguments
 from nerif.cli.cli import main
 from nerif.common.conventions import InputError
 from nerif.common.files import read_json, read_toml, read_yaml, write_toml
@@ -60,8 +61,19 @@ def test_deep_nesting_is_refused(tmp_path, name):
 )  # fmt: skip
 def test_pipes_are_refused(tmp_path, name, reader):
     os.mkfifo(tmp_path / name)
-    with pytest.raises(InputError):
+    with pytest.raises(InputError) as error:
         reader(tmp_path / name)
+    assert "no such file;" not in str(error.value)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes with names")
+@pytest.mark.parametrize("command", sorted(INPUTS))
+def test_every_command_says_that_its_input_is_a_pipe(tmp_path, command):
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    with pytest.raises(InputError, match="a pipe, socket or device; write its content to a file first") as error:
+        check_arguments(command, [str(pipe)])
+    assert error.value.field == str(pipe)
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes with names")

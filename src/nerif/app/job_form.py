@@ -17,7 +17,7 @@ from nerif.common.conventions import InputError
 __all__ = ["JobForm", "JobStatus"]
 
 EVERY = 0.7  # seconds
-LINES = 3  # of the log
+LINES, NOTE = 3, "note: "  # of the log; beginning of a note
 ENDS = {"done": "It is done.", "failed": "It failed; end of the log:", "stopped": "It was stopped."}
 
 
@@ -91,7 +91,7 @@ class JobStatus:
     name : key of the draft with the id of the run
     on_end : called when the run has ended
     on_continue : called by a button that continues with the output; None for no button
-    lines : number of log lines shown after success
+    lines : number of log lines shown after success, besides all notes
     """
 
     def __init__(
@@ -134,14 +134,16 @@ class JobStatus:
             return
         try:
             job = await self.work.in_thread(self.work.jobs.get, id)
-            log = await self.work.in_thread(self.work.jobs.log, id, self._lines.get(job.state, LINES))
+            log = await self.work.in_thread(self.work.jobs.log, id)
         except InputError:  # removed in another tab
             if id == self.job:
                 self._forget()
             return
         if id != self.job:  # another run has started meanwhile
             return
-        lines = [line.rpartition("\r")[2] for line in log]  # the last state of a progress bar
+        last = len(log) - self._lines.get(job.state, LINES)
+        lines = [line for i, line in enumerate(log) if i >= last or (job.state in ENDS and line.startswith(NOTE))]
+        lines = [line.rpartition("\r")[2] for line in lines]  # the last state of a progress bar
         if job.state not in ENDS:
             waits = {"queued": "It waits in the queue.", "held": "Start it under Runs: another server queued it."}
             self._show(waits.get(job.state, f"It is {job.state}."), lines[-1:])

@@ -20,6 +20,7 @@ from nerif.common.files import ending
 from nerif.data.volume import name_of
 from nerif.geometry import Box
 from nerif.plotting.drawing import colour_range, map_range
+from nerif.report.slice_images import slice_axes
 from nerif.report.view_images import image_address
 from nerif.results.directory import LIVE, LIVE_FIELD
 from nerif.results.live import Look, read_live, read_look
@@ -192,6 +193,7 @@ def look_html(look: Look) -> str:
     limits = colour_range(look.values)
     for normal, image in (("z", look.values[z]), ("y", look.values[:, y]), ("x", look.values[:, :, x])):
         middle = (look.lower["xyz".index(normal)] + look.upper["xyz".index(normal)]) / 2
-        text = f"{name_of(look.quantity)} at {normal} = {middle:g} mm; {limits[0]:.2g} to {limits[1]:.2g}"
+        text = f"{name_of(look.quantity)} {limits[0]:.2g} to {limits[1]:.2g} at {normal} = {middle:g} mm; "
+        text += slice_axes(look.volume.grid.box, normal)
         images.append((image_address(image[::-1], limits), text, text))
     return f"{images_html(images)}<p class=note>After {look.seconds:.0f} s, {escape(look.title)}.</p>"

@@ -13,7 +13,7 @@ from nerif.app.sliders import RangeSlider
 from nerif.app.workspace import Workspace
 from nerif.data.volume import Volume
 from nerif.geometry import Grid
-from nerif.report.slice_images import bar_image, slice_aspect, slice_image
+from nerif.report.slice_images import bar_image, slice_aspect, slice_axes, slice_image
 
 __all__ = ["Panel", "SlicesView"]
 
@@ -94,8 +94,9 @@ class SlicesView:
                 with ui.element("figure"):
                     image = ui.element("img").style(f"aspect-ratio: {aspect:.4f}; --aspect: {aspect:.4f}")
                     self._images[normal, number] = image
-                    if len(self.panels) > 1:
-                        ui.html(f"<figcaption>{escape(panel.title)}</figcaption>", sanitize=False)
+                    title = f"{panel.title}; " if len(self.panels) > 1 else ""
+                    text = escape(f"{title}{slice_axes(grid.box, normal)}")
+                    ui.html(f"<figcaption>{text}</figcaption>", sanitize=False)
 
     def _index(self, normal: str) -> int:
         count = self.panels[0].volume.grid.shape["zyx".index(normal)]

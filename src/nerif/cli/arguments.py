@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from nerif.common.conventions import InputError
-from nerif.common.files import ending
+from nerif.common.files import ending, instead_of_file
 
 __all__ = ["ALIASES", "INPUTS", "check_arguments", "check_output", "flag_value", "table", "words_of"]
 
@@ -60,8 +60,11 @@ def check_arguments(command: str, arguments: list[str]) -> None:
     if {"-h", "--help"} & {*words}:
         return
     is_read = command in INPUTS and MAKES_INPUT.get(command) not in words
-    if is_read and first and not first.startswith("-") and not os.path.lexists(first):
-        raise InputError(INPUTS[command], field=first)
+    if is_read and first and not first.startswith("-"):
+        if not os.path.lexists(first):
+            raise InputError(INPUTS[command], field=first)
+        if os.path.exists(first) and not (os.path.isfile(first) or os.path.isdir(first)):
+            raise InputError(instead_of_file(Path(first)), field=first)
     _check_options(command, words)
     out = flag_value(words, "-o", "--out")
     if command in OUTPUTS and out is not None and os.path.isfile(out) and "--force" not in words:

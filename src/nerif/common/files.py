@@ -24,8 +24,8 @@ from typing import Any
 from nerif.common.conventions import InputError
 
 __all__ = [
-    "DISK_FULL", "WINDOWS", "atomic", "check_file", "check_known", "ending", "is_file_name", "is_near", "local_path",
-    "read_json", "read_toml", "read_yaml", "recorded", "write_json", "write_toml", "written",
+    "DISK_FULL", "WINDOWS", "atomic", "check_file", "check_known", "ending", "instead_of_file", "is_file_name",
+    "is_near", "local_path", "read_json", "read_toml", "read_yaml", "recorded", "write_json", "write_toml", "written",
 ]  # fmt: skip
 
 WINDOWS = os.name == "nt"
@@ -163,14 +163,20 @@ def _remove(path: Path) -> None:
         path.unlink(missing_ok=True)
 
 
+def instead_of_file(path: Path) -> str:
+    """Return what a path is that is no regular file, in words."""
+    if not path.exists():
+        return "no such file"
+    return "a folder" if path.is_dir() else "a pipe, socket or device; write its content to a file first"
+
+
 def check_file(path: str | os.PathLike[str], expected: str = "file") -> None:
     """Raise InputError if a path is no regular file: a pipe would be waited for, a device has no end."""
     path = Path(path)
     if not path.exists():
         raise InputError(f"no such {expected}", field=path)
     if not path.is_file():
-        kind = "a folder" if path.is_dir() else "a pipe, socket or device"
-        raise InputError(f"{kind}, no {expected}", field=path)
+        raise InputError(f"{instead_of_file(path)}; expected a {expected}", field=path)
 
 
 def read_toml(path: str | os.PathLike[str], expected: str = "TOML file") -> dict[str, Any]:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from nerif.common.conventions import InputError
-from nerif.common.files import atomic
+from nerif.common.files import atomic, instead_of_file
 from nerif.common.hdf5 import open_hdf5
 from nerif.common.memory import check_memory
 
@@ -38,8 +38,7 @@ def opened(path: str | os.PathLike[str], expected: str) -> Iterator[xr.Dataset]:
     """
     path = Path(path)
     if not path.is_file():
-        what = "a folder" if path.is_dir() else "no such file"
-        raise InputError(f"{what}; expected {expected}", field=path)
+        raise InputError(f"{instead_of_file(path)}; expected {expected}", field=path)
     with reading(f"{path}: not a readable NetCDF file, or truncated"):
         dataset = _dataset(path)
     with dataset:

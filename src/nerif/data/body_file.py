@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from nerif.common.conventions import InputError
-from nerif.common.files import ending
+from nerif.common.files import ending, instead_of_file
 from nerif.geometry.body import UNITS, Body
 
 __all__ = ["FORMATS", "read_body"]
@@ -41,7 +41,7 @@ def read_body(
     if ending(path) not in FORMATS:
         raise InputError(f"expected a mesh of triangles ({', '.join(FORMATS)}); export the model as STL", field=path)
     if not path.is_file():
-        raise InputError("no such file; expected the mesh of a body", field=path)
+        raise InputError(f"{instead_of_file(path)}; expected the mesh of a body", field=path)
     vertices, faces = _triangles(path)
     try:
         body = Body(torch.from_numpy(vertices * UNITS[unit]), torch.from_numpy(faces), path.stem)

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from nerif.common.conventions import LARGEST_INDEX, LARGEST_LENGTH, STATISTICS, InputError
-from nerif.common.files import ending
+from nerif.common.files import ending, instead_of_file
 from nerif.common.netcdf import opened, values, write_dataset
 from nerif.data.kinds import VOLUME, reading_as
 from nerif.data.volume import QUANTITIES, Volume, describe, field_of, name_of
@@ -131,8 +131,7 @@ def _read(path: Path) -> Content:
 
 def _read_as_ending(path: Path) -> Content:
     if not path.is_file():
-        what = "a folder" if path.is_dir() else "no such file"
-        raise InputError(f"{what}; expected a volume (.nc or .vti)", field=path)
+        raise InputError(f"{instead_of_file(path)}; expected a volume (.nc or .vti)", field=path)
     if ending(path) == ".nc":
         with opened(path, "a volume (.nc or .vti)") as dataset:
             return _content(dataset)

@@ -175,7 +175,7 @@ def too_few_views(settings: SharedSettings, measurement: Measurement) -> str:
 
 
 def _determined(views: int) -> str:
-    """Return the symmetry with the most harmonics that so many views determine."""
+    """Return the symmetry with the most harmonics that this number of views determines."""
     return f"axis+{(views - 1) // 2}" if views > 2 else "axis"
 
 

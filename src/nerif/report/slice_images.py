@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from nerif.data.volume import Volume
+from nerif.geometry import Box
 from nerif.plotting.drawing import COLOUR_MAPS, PLANES, SEQUENTIAL
 from nerif.report.view_images import image_address
 
-__all__ = ["bar_image", "colours_of", "slice_aspect", "slice_image"]
+__all__ = ["bar_image", "colours_of", "slice_aspect", "slice_axes", "slice_image"]
 
 
 def colours_of(quantity: str) -> str:
@@ -39,6 +40,13 @@ def slice_aspect(volume: Volume, normal: str) -> float:
     across, up = PLANES[normal]
     edges = volume.grid.box.edges
     return edges["xyz".index(across)] / edges["xyz".index(up)]
+
+
+def slice_axes(box: Box, normal: str) -> str:
+    """Return the axes of the slice across an axis in words, to the right and up, with their ends, mm."""
+    ends = {axis: f"{axis} {low:g} to {high:g} mm" for axis, low, high in zip("xyz", box.lower, box.upper, strict=True)}
+    across, up = PLANES[normal]
+    return f"{ends[across]} →, {ends[up]} ↑"
 
 
 def bar_image(colours: str) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from html import escape
 from pathlib import Path, PurePosixPath
@@ -25,13 +25,16 @@ from nerif.common.installation import word_of
 from nerif.data.measurement_sequence import MeasurementSequence
 from nerif.reconstruction.methods import METHODS
 from nerif.reconstruction.neural.presets import PRESETS, preset
-from nerif.results.directory import VOLUME
+from nerif.reconstruction.progress import Monitor
+from nerif.results.directory import VOLUME, ResultDirectory
+from nerif.workflow.job import Job
 
 __all__ = ["PAGE"]
 
 WITHOUT = ("config", "measurement", "out", "method", "preset", "force", "resume", "live", "probes")
 MAIN = ("time_limit", "withhold", "uncertainty", "voxels")
 FILM = ".zarr"
+EVERY = 1.0  # seconds
 VALUES = {False: "values", True: "film_values"}  # key of the settings in the draft: of one instant, of a film
 FILM_WITHOUT = ("config", "measurement", "out", "preset", "force", "time_limit", "refine", "probes")
 FILM_MAIN = ("cluster", "workers", "chunk", "withhold", "voxels")
@@ -56,6 +59,12 @@ def form_of_film(preset_name: str) -> Form[Sequence]:
     return Form(record, without=FILM_WITHOUT)
 
 
+def prepare(path: Path, out: Path, settings: Reconstruct, say: Callable[[str], None]) -> None:
+    """Check the input of a run, which writes nothing, and say what the run would say at its start."""
+    voxels, monitor = getattr(settings, "voxels", None), Monitor(say)
+    Job(ResultDirectory(out), path, settings.reconstructor, settings.run, voxels=voxels, monitor=monitor)
+
+
 class ReconstructPage:
     """The page in one tab."""
 
@@ -78,12 +87,28 @@ class ReconstructPage:
                 self.out = ui.input("Result directory", value=self._free_name()).props("outlined dense debounce=250")
                 self.out.on_value_change(self._show)
                 self.place = ui.element("div").classes("form")
+                self.notes = ui.html("", sanitize=False).props('role=status aria-live="polite"')
                 self.start = ui.button("Start", icon="play_arrow", on_click=self._start).props("unelevated no-caps")
             with ui.element("div").classes("stack"):
                 with card("The same on the command line"):
                     self.command = CommandLine()
                 self.live = LiveView(work)
         self._build_form()
+        self._noted: list[str] = []  # arguments of the notes that are shown
+        ui.timer(EVERY, self._note)
+
+    async def _note(self) -> None:
+        """Show what the run would say of its settings before it starts, such as that its time limit is too short."""
+        arguments = self.arguments()
+        if arguments == self._noted or self.film or not (self.start.enabled and self.measurement.name):
+            return
+        self._noted = arguments
+        lines: list[str] = []
+        with refusals(lines.append):
+            path, out = (self.work.project.path(name) for name in (self.measurement.name, self.out.value))
+            await self.work.in_thread(prepare, path, out, self.view.record(), lines.append)
+        if arguments == self.arguments():
+            self.notes.set_content("".join(f"<p class=note>{escape(line)}</p>" for line in lines))
 
     def _select(self, label: str, options: Any, value: Any) -> ui.select:
         return select(label, options, value).on_value_change(self._on_choice)
