@@ -55,8 +55,9 @@ def gradient(points: np.ndarray) -> np.ndarray:
 
 
 # What the optical flow gives: (view, row, column, component), NaN where there is nothing.
-# d(p) = p - p0(p): the flow image shows at p what the reference shows at p0, so d is minus the optical flow from the
-# flow image to the reference. Here: the integral of the gradient across the line of sight, times the lever arm.
+# d is where a dot appears with flow minus where it appears without (px, u right, v down), on the flow image: minus the
+# optical flow from the flow image to the reference. Here: the integral of the gradient across the line of sight, times
+# the lever arm.
 noise, sigma = np.random.default_rng(0), 0.02  # px
 v, u = np.mgrid[:HEIGHT, :WIDTH]
 along = np.linspace(TO_CAMERA - 25, TO_CAMERA + 25, 101)  # mm from the camera

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -274,6 +275,20 @@ def test_two_estimates_are_averaged_where_they_agree():
     assert both.high / both.error < deviations.high / deviations.error
     assert views.mean(Estimate.within(0.01, 1.5, "b")) == views
     assert views.mean(Estimate.within(0.2, 1.5, "b")).error == 0.2
+
+
+@pytest.mark.parametrize(
+    ("metrics", "sentence"),
+    [
+        ({"views": VIEWS, "cross_validation": FIRST}, "estimated by predicting view a, left out of a short first run;"),
+        ({"views": [*VIEWS, view("g", 0.09, True)]}, "estimated by predicting view g, left out of the run;"),
+        ({"views": [*VIEWS, view("g", 0.09, True), view("h", 0.09, True)]}, "predicting 2 views, left out of the run;"),
+    ],
+)
+def test_the_error_is_stated_with_what_it_is_of_and_estimated_from(metrics, sentence):
+    found = judged(**metrics).sentence
+    assert re.match(r"Use: the field is wrong by about [\d.]+ % of its difference from the ambient \(rms, ", found)
+    assert sentence in found
 
 
 def test_the_headline_of_the_report():

@@ -210,6 +210,12 @@ def test_check_draws_the_rig_of_calibrations_and_measurements(experiment, tmp_pa
         assert run("calibrate", experiment / source, "--check", "-o", out, *BOX) == 0
         assert iio.imread(out.with_suffix(".rig.png")).std() > 5
         assert not out.exists()
+        assert run("calibrate", experiment / source, "--check", "-o", out, *BOX) == 0  # over its own picture
+    source, out = experiment / "calibration.toml", tmp_path / "calibration.toml"
+    assert run("calibrate", source, "-o", out) == 0  # beside the picture
+    before = out.read_bytes()
+    assert run("calibrate", source, "-o", out) == 2
+    assert out.read_bytes() == before
 
 
 def test_calibrations_of_other_programs_are_imported(experiment, tmp_path, capsys):

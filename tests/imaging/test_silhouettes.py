@@ -75,8 +75,12 @@ def test_turns_of_a_ball_are_not_determined(flow):
 
 def test_an_outline_far_away_is_refused(flow):
     seen = with_bodies(flow, [BRICK])
-    with refused("brick"):
+    with refused("brick") as error:
         refine_pose(seen, turned(BRICK, shift=(0.0, 0.0, 17.0)))
+    assert "--refine needs pixels without data where the body is" in str(error.value)
+    with refused("brick") as error:
+        refine_pose(flow, BRICK)
+    assert str(error.value).endswith("--refine needs pixels without data where the body is, got none")
 
 
 def test_the_hull_of_silhouettes_contains_the_body(flow):

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import base64
+import re
+from pathlib import Path
 
 import imageio.v3 as iio
 import numpy as np
 import pytest
 import tifffile
 
+from nerif.common.conventions import InputError
 from nerif.imaging.calibration.target_images import find_targets, pose_names
 from nerif.imaging.calibration.targets import CalibrationTarget
 from nerif.imaging.image_quality import image_quality, jpeg_address, shrink
@@ -24,6 +27,14 @@ SHAPE = (20, 30)
 def save(path, image):
     path.parent.mkdir(parents=True, exist_ok=True)
     tifffile.imwrite(path, image)
+
+
+def test_the_folders_that_are_expected_are_named_by_a_path_that_works(tmp_path, monkeypatch):
+    (tmp_path / "run").mkdir()
+    monkeypatch.chdir(tmp_path / "run")
+    for folder in (Path(), Path("../run"), tmp_path / "run"):
+        with pytest.raises(InputError, match=re.escape(f"expected folders such as {folder / 'cam1' / 'reference'} and")):
+            find_views(folder)
 
 
 @pytest.fixture

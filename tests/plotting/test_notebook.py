@@ -16,12 +16,47 @@ import pytest
 import torch
 
 import nerif
+from nerif.cli.cli import main
+from nerif.common.conventions import percent, with_unit
 from nerif.data.measurement import Measurement
 from nerif.data.volume import Volume
 from nerif.fields.base import Field
 from nerif.geometry import Box, Grid
-from nerif.plotting.notebook import VIEWS, panel, show_views
+from nerif.plotting.notebook import VIEWS, number, panel, show_views
+from nerif.reconstruction.base import Outcome
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
+
+
+@pytest.mark.parametrize(
+    ("share", "digits", "text"),
+    [(0.0, 1, "0.0%"), (1e-9, 1, "under 0.1%"), (4e-4, 1, "under 0.1%"), (6e-4, 1, "0.1%"), (3e-5, 2, "under 0.01%"),
+     (0.004, 0, "under 1%"), (0.33, 0, "33%"), (1.0, 2, "100.00%")],
+)  # fmt: skip
+def test_a_small_share_is_not_none(share, digits, text):
+    assert percent(share, digits) == text
+
+
+@pytest.mark.parametrize(("unit", "text"), [("grey value", "2510 grey values"), ("1", "2510"), ("px", "2510 px")])
+def test_units_as_printed(unit, text):
+    assert with_unit(2510, unit) == text
+
+
+@pytest.mark.parametrize(
+    ("reason", "sentence"),
+    [("steps", "5 done"), ("converged", "converged: 5 done"), ("collapsed", "no field found: 5 done")],
+)
+def test_why_a_run_ended_is_said_once(reason, sentence):
+    assert Outcome(reason, "5 done").sentence == sentence
+
+
+def test_one_rms_is_of_rays_that_cross_the_box(measurement, tmp_path, capsys):
+    half = replace(measurement, box=Box(measurement.box.lower, measurement.box.centre))
+    half.write(tmp_path / "m.nc")
+    _, values, _ = half.rays()
+    rms = float(values.double().square().mean().sqrt())
+    assert dict(half.summary())["Displacement"].startswith(f"rms {number(rms, 3)} px")
+    assert main(["info", str(tmp_path / "m.nc")]) == 0
+    assert f"rms displacement {rms:.4g} px" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("name", nerif.__all__)

@@ -130,9 +130,9 @@ class Verdict:
         head = f"{self.rating[0].upper()}{self.rating[1:]}: "
         if self.error is None:
             return f"{head}{self.reasons}."
-        span = "" if self.low is None or self.high is None else f" ({_percent(self.low)} to {_percent(self.high)})"
-        error = f"the field is wrong by about {_percent(self.error)} of its difference from the ambient (rms)"
-        return f"{head}{error}{span}, {self.reasons}."
+        span = "" if self.low is None or self.high is None else f", {_percent(self.low)} to {_percent(self.high)}"
+        error = f"the field is wrong by about {_percent(self.error)} of its difference from the ambient (rms{span})"
+        return f"{head}{error}, {self.reasons}."
 
 
 def verdict(result: Result) -> Verdict:

@@ -145,7 +145,8 @@ class Measurement:
     Parameters
     ----------
     cameras : one per view; their names are those of the views
-    displacement : (view, row, column, 2) d = p - p0 on the grid of the flow image, px; NaN: no data; None for other
+    displacement : (view, row, column, 2) where a dot appears with flow minus where it appears without (px, u right,
+        v down), on the grid of the flow image; NaN: no data; None for other
         techniques
     box : Box, mm
     n_ambient : refractive index around the flow

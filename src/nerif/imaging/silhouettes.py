@@ -127,9 +127,12 @@ def refine_pose(
     Raises
     ------
     InputError
-        If too few points of an outline are near the body.
+        If there are no silhouettes, or too few points of an outline are near the body.
     """
     masks = silhouettes_of(measurement) if silhouettes is None else silhouettes
+    if not bool(masks.any()):
+        where = "pixels without data" if silhouettes is None else "silhouettes"
+        raise InputError(f"--refine needs {where} where the body is, got none", field=body.name)
     rays, pixel = _outlines(measurement, masks)
     prior = torch.tensor([PRIOR[0]] * 3 + [PRIOR[1] * max(measurement.box.edges)] * 3, dtype=torch.float64)
     centre = body.vertices.mean(dim=0)
@@ -141,8 +144,8 @@ def refine_pose(
         near = residual.abs() < gate
         if int(near.sum()) < FEWEST:
             raise InputError(
-                f"expected its outline within {gate:g} px of where it is, got {int(near.sum())} points of it; check "
-                "its place, or the silhouettes",
+                f"--refine needs {'pixels without data' if silhouettes is None else 'silhouettes'} where the body is, "
+                f"got {int(near.sum())} points of their outline within {gate:g} px of its own; check its place",
                 field=body.name,
             )
         arm = points - centre - pose[3:]

@@ -254,14 +254,13 @@ def _of_residuals(result: Result) -> list[Statement]:
     if high > NOISE_RANGE[1]:
         white = bool((highest.get("residual_test") or {"white": False})["white"])
         level = "warning" if high <= 3 or white else "bad"  # a white residual may be noise with a wrong sigma
-        text = f"The residual of training view {_place(highest, views)} is {high:.1f} × the stated noise. "
-        short = f"a short run ({longer(result)})" if longer(result) else ""
-        faces = "" if result.settings.get("open_faces") else "flow that leaves the box (--open-faces)"
-        causes = (short, faces, "the calibration (nerif check)", "a sigma that is too small")
-        text += f"Possible causes: {', '.join(filter(None, causes))}."
+        text = f"Training view {_place(highest, views)}: residual {high:.1f} times the noise: "
+        faces = "" if result.settings.get("open_faces") else "flow that leaves the box (--open-faces), "
+        causes = f"possible causes: {faces}the calibration (run nerif check), a sigma that is too small."
+        text += f"first run longer ({longer(result)}); if it stays, run nerif check." if longer(result) else causes
         remarks.append(Statement(level, text))
     if low < NOISE_RANGE[0]:
-        text = f"The residual of training view {_place(lowest, views)} is {low:.2f} × the stated noise: "
+        text = f"The residual of training view {_place(lowest, views)} is {low:.2f} times the noise: "
         remarks.append(Statement("warning", text + "the field fits noise, or sigma is too large."))
     return remarks or [
         Statement("good", f"The residuals of the training views are {low:.2f} to {high:.2f} × the noise.")

@@ -37,6 +37,8 @@ UNRECORDED = ("out", "force", "config", "frames", "frame_offset")  # or recorded
 class Displacement(Settings):
     """Compute the displacements of all views, and write them with the calibration as a measurement.
 
+    Displacement: where a dot appears with flow minus where it appears without (px, u right, v down).
+
     FOLDER has for each view VIEW/reference (images without flow; three or more give the noise) and VIEW/flow (images
     with flow), or a views.toml with their places. Optional: VIEW/mask.png (flow region), VIEW/region.png (visible
     background).
