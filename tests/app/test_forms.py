@@ -9,7 +9,7 @@ import tyro
 
 from nerif.app.form_view import _control_value, _record_value
 from nerif.app.forms import Form
-from nerif.app.pages.reconstruct import form_of
+from nerif.app.pages.reconstruct import form_of, prepare
 from nerif.cli.commands.design import Design
 from nerif.cli.commands.export import Export
 from nerif.cli.commands.reconstruct import command_of
@@ -104,6 +104,23 @@ def test_the_command_line_of_nested_fields_and_switches_gives_the_same_record():
     parsed = parse(given, ["m.nc", "-o", "x", *form.arguments(values)], "nerif reconstruct", "")
     assert parsed.run == made.run
     assert parsed.reconstructor == made.reconstructor
+
+
+@pytest.mark.parametrize(
+    ("values", "lines"),
+    [
+        ({}, []),
+        ({"time_limit": 1.0}, ["--time-limit 1 is too short"]),
+        ({"time_limit": 1.0, "symmetry": "axis+2"}, ["too few for 2 harmonics", "--time-limit 1 is too short"]),
+    ],
+)
+def test_what_a_run_would_say_at_its_start_is_said_before(measurement, tmp_path, values, lines):
+    path, found = tmp_path / "m.nc", list[str]()
+    measurement.select(measurement.names[:4]).write(path)
+    prepare(path, tmp_path / "r", form_of("nerif", "fast").build({"voxels": 8, **values}), found.append)
+    assert len(found) == len(lines)
+    assert all(line in text for line, text in zip(lines, found, strict=True))
+    assert [p.name for p in tmp_path.iterdir()] == ["m.nc"]
 
 
 def test_defaults_are_not_written():

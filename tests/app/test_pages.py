@@ -100,6 +100,15 @@ def test_every_control_has_a_name_and_the_page_its_landmarks(browser, server):
         assert browser.execute_script("return document.documentElement.lang").startswith("en")
 
 
+def test_too_short_a_time_limit_is_said_before_the_start(browser, server):
+    visit(browser, server, "reconstruct")
+    put(browser, "time_limit", "1")
+    said = "[...document.querySelectorAll('[role=status] .note')].map(e => e.textContent).join()"
+    wait_for(browser, f"return {said}.includes('--time-limit 1 is too short')", 60)
+    put(browser, "time_limit", "0")
+    wait_for(browser, f"return {said} === ''", 60)
+
+
 @pytest.mark.slow
 def test_a_run_is_started_watched_and_stopped(browser, server, folder):
     visit(browser, server, "reconstruct")

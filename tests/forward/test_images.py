@@ -274,6 +274,7 @@ def test_a_run_notes_where_images_follow_and_its_pace_continues(taken, both):
     settings, steps = replace(NETWORK, max_steps=12, network=NetworkShape(depth=1, width=8)), []
     Trainer(settings, TrainingData(settings, fewer)).run(steps.append)
     assert [s.step for s in steps if s.note] == [5]
+    assert steps[4].note == "now fitting images; loss values before and after cannot be compared"
     assert all(s.rays_per_second > 0 for s in steps)
 
 

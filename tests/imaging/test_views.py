@@ -33,7 +33,8 @@ def test_the_folders_that_are_expected_are_named_by_a_path_that_works(tmp_path, 
     (tmp_path / "run").mkdir()
     monkeypatch.chdir(tmp_path / "run")
     for folder in (Path(), Path("../run"), tmp_path / "run"):
-        with pytest.raises(InputError, match=re.escape(f"expected folders such as {folder / 'cam1' / 'reference'} and")):
+        expected = f"expected folders such as {folder / 'cam1' / 'reference'} and"
+        with pytest.raises(InputError, match=re.escape(expected)):
             find_views(folder)
 
 

@@ -44,7 +44,7 @@ MAKES_INPUT = {"app": "--demo"}
 OUTPUTS = ("design", "pattern", "mask", "body", "check", "simulate", "project", "movie", "export")
 """Commands that write a file (--out), and overwrite none without --force."""
 OPTIONS = Path(__file__).with_name("options.json")
-ALIASES = {"from": "source", "drawn": "drawings", "known": "probes"}
+ALIASES: dict[str, str] = {"from": "source", "drawn": "drawings", "known": "probes"}
 """Further names of options, and those of their fields."""
 VARIANTS = {"reconstruct": ("--method", "METHODS"), "pattern": ("--kind", "KINDS")}
 """The option on which the others of a command depend, and the name of its choices in the module of the command."""
