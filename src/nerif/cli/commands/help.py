@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import inspect
+import re
 import textwrap
 import types
 import typing
@@ -11,7 +13,7 @@ from typing import Any, Literal
 from nerif.cli.arguments import ALIASES
 from nerif.cli.commands.settings import flat_names, help_of
 
-__all__ = ["GROUPS", "grouped_help"]
+__all__ = ["GROUPS", "print_help"]
 
 WIDTH, INDENT = 100, 26
 
@@ -19,31 +21,31 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "data": ("source", "withhold", "open_faces", "lower", "upper", "start_from"),
     "method": ("method", "preset", "symmetry", "refine", "seed", "device"),
     "limits": ("time_limit", "max_steps", "iterations"),
+    "frames": ("chunk", "warm_steps", "velocity", "quantities", "retry"),
+    "computers": ("cluster", "workers", "dashboard"),
     "outputs": ("out", "voxels", "report", "force", "resume"),
     "uncertainty": ("uncertainty",),
 }
 """Options that people set, by group."""
 
 
-def grouped_help(default: Any, prog: str, description: str) -> str:
-    """Return the help of a command: usage, the options of GROUPS, and where the others are."""
-    names = flat_names(type(default))
+def print_help(default: Any, prog: str) -> None:
+    """Print the help of a command: usage, the options of GROUPS, and where the others are."""
+    names, description = flat_names(type(default)), inspect.getdoc(type(default)) or ""
     lines = [
         f"usage: {prog} MEASUREMENT --out OUT [options]",
         "",
-        *(line for text in description.splitlines() for line in textwrap.wrap(text, WIDTH) or [""]),
+        *"\n\n".join(textwrap.fill(text, WIDTH) for text in description.split("\n\n")).splitlines(),
     ]
     for group, options in GROUPS.items():
-        lines += ["", f"{group}:"]
-        for name in options:
-            if name in names:
-                lines += _option(default, names[name])
+        if known := [name for name in options if name in names]:
+            lines += ["", f"{group}:", *(line for name in known for line in _option(default, names[name]))]
     lines += [
         "",
         "--help all lists every option. Any of them can also be given as --set NAME=VALUE, such as",
         "--set network.width=128, or in a settings file: --config FILE.toml.",
     ]
-    return "\n".join(lines) + "\n"
+    print("\n".join(lines))
 
 
 def _option(default: Any, place: tuple[str, ...]) -> list[str]:
@@ -54,7 +56,7 @@ def _option(default: Any, place: tuple[str, ...]) -> list[str]:
     flags = [f"--{flag}" for flag, field in ALIASES.items() if field == name] or [f"--{name.replace('_', '-')}"]
     if name == "out":
         flags.insert(0, "-o")
-    text = " ".join(help_of(type(owner), name).split())
+    text = re.sub(r" \(also --[\w-]+\)", "", " ".join(help_of(type(owner), name).split()))
     if isinstance(value, bool):
         flags.append(f"--no-{name.replace('_', '-')}")
     elif isinstance(value, str | int | float | tuple) and value != () and "default:" not in text:

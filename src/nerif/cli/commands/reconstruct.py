@@ -15,7 +15,7 @@ import psutil
 import tyro
 
 from nerif.cli.arguments import flag_value
-from nerif.cli.commands.help import grouped_help
+from nerif.cli.commands.help import print_help
 from nerif.cli.commands.output import MONITOR
 from nerif.cli.commands.settings import Flat, Settings, read_settings, setting_of
 from nerif.common.conventions import InputError
@@ -148,8 +148,6 @@ def main(arguments: list[str]) -> None:
     if arguments[-2:] == ["--help", "all"]:
         arguments = arguments[:-1]
     elif {"-h", "--help"} & set(arguments):
-        default = command(**defaults)
-        print(grouped_help(default, "nerif reconstruct", inspect.getdoc(type(default)) or ""), end="")
-        return
+        return print_help(command(**defaults), "nerif reconstruct")
     if run(read_settings(command(**defaults), arguments, "reconstruct", file)).outcome.failed:
         raise SystemExit(1)
