@@ -154,7 +154,7 @@ def test_tigres_circular_scan(tmp_path):
     }  # fmt: skip
     np.savez(path, angles=angles, **geometry)
     cameras = import_cameras(path, say=lines.append)
-    assert "view0, view1" in lines[0]
+    assert "unnamed1, unnamed2" in lines[0]
     assert "upside down" in lines[0]
     for angle, camera in zip(angles, cameras, strict=True):
         cos, sin = np.cos(angle), np.sin(angle)

@@ -19,6 +19,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from nerif.cli.commands import calibrate
+from nerif.cli.commands.displacement import Displacement
 from nerif.common.conventions import InputError
 from nerif.geometry import TELECENTRIC, Box, Camera, Lens, Plane
 from nerif.imaging.calibration.cameras_file import CalibratedCamera, read_box, read_cameras, write_cameras
@@ -670,6 +671,64 @@ def test_nerf_angle_of_view(nerf):
     (got,) = import_cameras(nerf({"transform_matrix": matrix}, camera_angle_x=0.2))
     assert float(got.intrinsics[0, 0]) == pytest.approx(100 / np.tan(0.1))
     assert float(got.intrinsics[0, 2]) == pytest.approx(99.5)
+
+
+@pytest.mark.parametrize(
+    ("images", "names"),
+    [
+        (("images/cam1/0001.png", "images/cam2/0001.png", "images/cam3/0001.png"), "cam1 cam2 cam3"),
+        ((".\\cam_3\\rgb\\7.png", ".\\cam_1\\rgb\\7.png", ".\\cam_2\\rgb\\8.png"), "cam_3 cam_1 cam_2"),
+        (("cam2/b.png", "cam1/a.png", "cam3/c.png"), "cam2 cam1 cam3"),
+        (("b/left_01.tif", "b/top_01.tif", "b/right_01.tif"), "left top right"),
+        (("b/cam_1.tif", "b/cam_2.tif", "b/cam_4.tif"), "cam_1 cam_2 cam_4"),
+        (("train/0003.png", "train/0001.png", "val/0002.png"), "0003 0001 0002"),
+        (("a/x.png", "b/x.png", "b/x.png"), "unnamed1 unnamed2 unnamed3"),
+        ((None, "b/x.png", "b/y.png"), "unnamed1 unnamed2 unnamed3"),
+    ],
+)
+def test_folders_and_files_of_images_name_the_cameras(nerf, images, names):
+    cameras = [make("", seed) for seed in range(3)]
+    frames = [{**transforms(c), "file_path": image} for c, image in zip(cameras, images, strict=True)]
+    got = import_cameras(nerf(*frames), ImportSettings(scale_mm=1000.0))
+    assert " ".join(c.name for c in got) == names
+    assert same(got, *cameras)
+
+
+def test_images_of_one_camera_are_one_camera(nerf):
+    images = [(ONE, "cam1/a.png"), (TWO, "cam2/a.png"), (ONE, "cam1/b.png"), (TWO, "cam2/b.png")]
+    path = nerf(*({**transforms(camera), "file_path": image} for camera, image in images))
+    got = import_cameras(path, ImportSettings(scale_mm=1000.0))
+    assert [c.name for c in got] == ["cam1", "cam2"]
+    assert same(got, ONE, TWO)
+
+
+@pytest.mark.parametrize("imported", [False, True])
+def test_cameras_without_names_are_assigned_by_order_to_as_many_views(tmp_path, nerf, capsys, imported):
+    """Of 0003.png, 0001.png, 0002.png the first by number is that of the first view; cam10 stands behind cam9."""
+    folder, cameras = tmp_path / "experiment", [make("", seed) for seed in range(3)]
+    path = nerf(*({**transforms(c), "file_path": f"{n}.png"} for c, n in zip(cameras, (30, 9, 10), strict=True)))
+    if imported:
+        calibrate.main([str(path), "--image-size", "160", "200", "-o", str(path := tmp_path / "c.toml")])
+        assert "3 cameras imported from" in capsys.readouterr().out
+
+    def recorded(*views: str, only: tuple[str, ...] = ()) -> list[int]:
+        """The number of the camera of each view."""
+        for name in views:
+            (folder / name / "flow").mkdir(parents=True, exist_ok=True)
+        box: Any = {"lower": (-1.0, -1.0, -1.0), "upper": (1.0, 1.0, 1.0)}
+        recording = Displacement(folder, path, tmp_path / "m.nc", views=only, **box).recording()
+        got = [recording.cameras[view.name] for view in recording.views]
+        assert [camera.name for camera in got] == [view.name for view in recording.views]
+        return [int(camera.intrinsics[0, 0]) - 1500 for camera in got]
+
+    with pytest.raises(InputError, match=r"3 cameras have numbers instead of names \(.*2 views \(cam9, cam10\)"):
+        recorded("cam9", "cam10")
+    assert recorded("cam11") == [1, 2, 0]
+    assert "in order (cam9: 9, cam10: 10, cam11: 30)" in capsys.readouterr().out
+    assert recorded(only=("cam10",)) == [2]
+    path.write_text(path.read_text().replace('"30.png"', '"cam11.png"').replace('"30"', '"cam11"'))
+    with pytest.raises(InputError, match="no camera named 'cam9', only"):
+        recorded()
 
 
 @pytest.mark.parametrize("model", ["OPENCV", "PINHOLE", "SIMPLE_RADIAL"])

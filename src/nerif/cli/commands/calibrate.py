@@ -97,7 +97,7 @@ def run(settings: Calibrate) -> None:
             box or import_box(settings.source, imports),
         )
         write_cameras(out, cameras, {"source": str(settings.source)}, box)
-        say(f"{out}: {len(cameras)} cameras imported from {settings.source}")
+        say(f"{out}: {len(cameras)} cameras imported from {settings.source}: {', '.join(c.name for c in cameras)}")
         _draw(rig, cameras, box)
         return
     result = replace(_calibrate(settings), lens=imports.lens, mount=imports.pose_sigma or MOUNT)

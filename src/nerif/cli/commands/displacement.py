@@ -81,9 +81,11 @@ class Displacement(Settings):
     def recording(self) -> Recording:
         """Return images, cameras and box."""
         from nerif.imaging.calibration.importers.importers import import_box, import_cameras
+        from nerif.imaging.calibration.importers.names import cameras_by_view
 
         views = find_views(self.folder, self.views, self.frame_offset)
-        cameras = {c.name: c for c in import_cameras(self.calibration)}
+        everything = [view.name for view in find_views(self.folder)]
+        cameras = cameras_by_view(everything, import_cameras(self.calibration), say)
         box = Box.between(self.lower, self.upper) or import_box(self.calibration)
         if box is None:
             raise InputError(

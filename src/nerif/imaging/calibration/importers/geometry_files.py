@@ -18,6 +18,7 @@ from nerif.common.npz import open_npz
 from nerif.geometry.astra import camera_of, from_astra
 from nerif.geometry.tigre import from_tigre
 from nerif.imaging.calibration.cameras_file import CalibratedCamera
+from nerif.imaging.calibration.importers.names import UNNAMED
 
 __all__ = ["read_geometry"]
 
@@ -41,7 +42,7 @@ def read_geometry(path: Path, say: Callable[[str], None]) -> list[CalibratedCame
         else:
             got = ", ".join(entries) or "nothing"
             raise InputError(f"expected {', '.join(ASTRA)} (ASTRA) or {', '.join(TIGRE)} (TIGRE), got {got}")
-        names = [str(name) for name in entries.get("views", [f"view{i}" for i in range(len(rows))])]
+        names = [str(name) for name in entries.get("views", [f"{UNNAMED}{i + 1}" for i in range(len(rows))])]
         results = [camera_of(kind, row, size, name) for row, name in zip(rows, names, strict=True)]
     except InputError as error:
         raise error.inside(path) from None

@@ -28,6 +28,7 @@ from nerif.common.conventions import InputError
 from nerif.common.hdf5 import open_hdf5
 from nerif.common.memory import check_memory
 from nerif.imaging.calibration.cameras_file import CalibratedCamera, check_distortion, check_model, flat, numbers
+from nerif.imaging.calibration.importers.names import UNNAMED
 
 __all__ = ["read_matlab"]
 
@@ -229,7 +230,7 @@ def _plain_cameras(content: dict[str, Any], name: str, path: Path) -> list[Calib
             array = np.asarray(value)
             stacked = key in STACKED and array.ndim == STACKED[key] + 1 and array.shape[-1] == count
             entries[key] = array[..., i] if stacked else value
-        cameras.append(_plain(entries, f"cam{i + 1}", path))
+        cameras.append(_plain(entries, f"{UNNAMED}{i + 1}", path))
     return cameras
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +11,7 @@ import torch
 from nerif.common.conventions import InputError
 from nerif.common.files import read_json
 from nerif.imaging.calibration.cameras_file import CalibratedCamera, check_distortion, check_model, numbers
+from nerif.imaging.calibration.importers.names import named_by_images
 
 __all__ = ["read_transforms"]
 
@@ -24,19 +24,18 @@ def read_transforms(path: Path) -> list[CalibratedCamera]:
     """Read a transforms.json.
 
     transform_matrix is camera to world with OpenGL's camera axes (x right, y up, z back); cx and cy count from the
-    corner of the first pixel, whose centre is at 0.5. Entries of a frame override those above the frames.
+    corner of the first pixel, whose centre is at 0.5. Entries of a frame override those above the frames. The paths of
+    the images name the cameras.
     """
     content = read_json(path)
     frames = content.get("frames") if isinstance(content, dict) else None
     if not isinstance(frames, list) or not frames or not all(isinstance(f, dict) for f in frames):
         raise InputError("expected NeRF's transforms.json with a list 'frames', got none", field=path)
-    cameras = [_camera({**content, **frame}, i, f"{path}: frame {i}") for i, frame in enumerate(frames)]
-    if len({c.name for c in cameras}) < len(cameras):
-        return [replace(c, name=f"cam{i}") for i, c in enumerate(cameras)]
-    return cameras
+    cameras = [_camera({**content, **frame}, f"{path}: frame {i}") for i, frame in enumerate(frames)]
+    return named_by_images(cameras, [str(frame.get("file_path") or "") for frame in frames])
 
 
-def _camera(entries: dict[str, Any], i: int, where: str) -> CalibratedCamera:
+def _camera(entries: dict[str, Any], where: str) -> CalibratedCamera:
     entries = {key: value for key, value in entries.items() if value is not None}
     for model in (entries.get("camera_model", "perspective"), *(k for k in OTHER_MODELS if entries.get(k))):
         check_model(model, where)
@@ -62,7 +61,7 @@ def _camera(entries: dict[str, Any], i: int, where: str) -> CalibratedCamera:
     rotation = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)) @ to_world[:3, :3].T
     return CalibratedCamera.from_values(
         where,
-        Path(str(entries.get("file_path", f"cam{i}"))).stem,
+        "",
         [[fx, 0, cx], [0, fy, cy], [0, 0, 1]],
         rotation,
         -rotation @ to_world[:3, 3],

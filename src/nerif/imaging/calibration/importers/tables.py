@@ -13,6 +13,7 @@ from nerif.common.conventions import InputError
 from nerif.common.files import check_known, read_toml
 from nerif.geometry import PERSPECTIVE
 from nerif.imaging.calibration.cameras_file import FORMAT, CalibratedCamera, read_cameras
+from nerif.imaging.calibration.importers.names import UNNAMED
 
 __all__ = ["read_csv", "read_tables"]
 
@@ -116,7 +117,7 @@ def _row(cells: dict[str, str], number: int, path: Path) -> CalibratedCamera:
     normal, size = ([x.get(k, math.nan) for k in keys] for keys in (("nx", "ny", "nz"), ("height", "width")))
     return CalibratedCamera.from_values(
         f"{path}: line {number + 1}",
-        cells.get("name", f"cam{number}"),
+        cells.get("name", f"{UNNAMED}{number}"),
         [[x["fx"], x["s"], x["cx"]], [0, x["fy"], x["cy"]], [0, 0, 1]],
         [[x[f"r{i}{j}"] for j in (1, 2, 3)] for i in (1, 2, 3)],
         [x["tx"], x["ty"], x["tz"]],
