@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 import trimesh
@@ -37,6 +38,18 @@ def test_triangles_that_face_inwards_are_turned_with_a_note(tmp_path):
     trimesh.Trimesh(body.vertices.numpy(), body.faces.flip(1).numpy(), process=False).export(path)
     assert read_body(path, say=lines.append).volume == pytest.approx(1000.0)
     assert "mirrored" in lines[0]
+
+
+@pytest.mark.parametrize("scale", [0.1, 1.0, 30.0])
+def test_vertices_that_a_program_rounded_are_joined(tmp_path, scale):
+    """Each triangle of a file has vertices of its own, 2e-6 mm from those of its neighbours."""
+    path, body = tmp_path / "model.ply", ball(5.0, rings=16)
+    corners = scale * body.corners.reshape(-1, 3).numpy()
+    corners += np.random.default_rng(0).uniform(-1e-6, 1e-6, corners.shape)
+    trimesh.Trimesh(corners, np.arange(len(corners)).reshape(-1, 3), process=False).export(path)
+    again = read_body(path)
+    assert (len(again.vertices), len(again.faces)) == (len(body.vertices), len(body.faces))
+    assert again.volume == pytest.approx(scale**3 * body.volume, rel=1e-5)
 
 
 def test_an_open_mesh_is_refused(tmp_path):

@@ -163,8 +163,13 @@ def test_tigres_circular_scan(tmp_path):
         u, v = across * 1536 / depth + 2.0, z * 1536 / depth - 3.0
         pixels = np.stack([u / 0.6 + 99.5, SIZE[0] - 1 - (v / 0.8 + 64.5)], axis=1)
         assert np.allclose(camera.camera().project(POINTS), pixels)
-    for change, words in (({"COR": 2.0}, "COR"), ({"mode": "parallel"}, "mode"), ({"DSD": np.ones(5)}, "DSD")):
-        np.savez(path, angles=angles, **{**geometry, **change})
+    for change, words in (
+        ({"COR": 2.0}, "COR"), ({"mode": "parallel"}, "mode"), ({"DSD": np.ones(5)}, "DSD"), ({"DSD": 1000.0}, "DSD"),
+        ({"DSO": 1536.0, "DSD": 1000.0}, "DSD"), ({"DSO": np.array([1000.0, 1600.0])}, "DSD"), ({"DSO": -9.0}, "DSD"),
+        ({"angles": np.array([0.0, 45.0])}, "angles"), ({"angles": np.array([[-30.0, 0, 0], [0, 0, 0]])}, "angles"),
+        ({"angles": np.array([0.0, np.nan])}, "angles"), ({"rotDetector": np.array([0.0, 0, 90])}, "rotDetector"),
+    ):  # fmt: skip
+        np.savez(path, **{"angles": angles, **geometry, **change})
         with refused(words):
             import_cameras(path)
 

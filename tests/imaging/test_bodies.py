@@ -90,6 +90,16 @@ def test_a_body_in_the_wrong_place_is_refused(flow):
         with_bodies(flow, [cuboid((-19.0, 16.0, -19.0), (19.0, 17.0, 19.0))], margin=16)
 
 
+@pytest.mark.parametrize("factor", [1 / 25.4, 0.1])
+def test_a_body_in_inches_or_cm_is_refused_unless_its_unit_is_stated(flow, factor):
+    """A ball of 12 mm in a box of 40; as for metres."""
+    small = ball(6.0 * factor, name="model")
+    with pytest.raises(InputError, match="model: .* got 0.39% by one of .* lengths in cm, in or m .* --unit mm"):
+        with_bodies(flow, [small])
+    placed = with_bodies(flow, [small], unit_stated=True)
+    assert len(with_bodies(placed, [*placed.bodies, ball(6.0, (8.0, 0.0, 0.0))]).bodies) == 2
+
+
 def test_pixels_without_data_that_show_the_body_mirrored_name_the_axis(flow):
     there = ball(5.0, (9.0, 3.0, 6.0), name="model")
     blank = without_bodies(with_bodies(flow, [there]))

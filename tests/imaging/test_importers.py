@@ -363,6 +363,15 @@ def test_opencv_folders_and_numbered_cameras(tmp_path):
     refuse(tmp_path, "more.yml: expected cameras of .*, got 'cam1' here and in both.xml")
 
 
+@pytest.mark.parametrize("numbers", [("0", "1", "2"), ("_0", "_1", "_2"), ("01", "02", "03"), ("7", "40", "100")])
+def test_opencv_cameras_are_counted_from_any_number(tmp_path, numbers):
+    path, three = tmp_path / "rig.yml", (ONE, TWO, make("three", 5))
+    write_opencv(path, {f"{k}{n}": v for n, c in zip(numbers, three, strict=True) for k, v in arrays(c).items()})
+    got = import_cameras(path)
+    assert [c.name for c in got] == [f"cam{n.strip('_')}" for n in numbers]
+    assert same(got, *three)
+
+
 def test_opencv_tilt_is_the_end_of_14_coefficients(tmp_path):
     path, table, values = tmp_path / "c.yml", tmp_path / "c.toml", arrays(TILTED)
     coefficients = np.concatenate([values["D"], np.zeros(7), TILTED.tilt.numpy()])
@@ -415,18 +424,19 @@ def test_unread_distortion_is_refused(tmp_path, key):
     assert same(import_cameras(path), ONE)
 
 
-@pytest.mark.parametrize("rectified", [False, True])
-def test_opencv_stereo_pair(tmp_path, rectified):
+@pytest.mark.parametrize(("rectified", "first"), [(False, 1), (True, 1), (False, 0)])
+def test_opencv_stereo_pair(tmp_path, rectified, first):
     """Maybe with what stereoRectify adds, of which R1 and R2 are no poses."""
     a, b, path = arrays(ONE), arrays(TWO), tmp_path / "stereo.yml"
     rotation = b["R"] @ a["R"].T
-    pair = {"M1": a["K"], "D1": a["D"], "M2": b["K"], "D2": b["D"], "R": rotation, "T": b["t"] - rotation @ a["t"]}
+    pair = {"R": rotation, "T": b["t"] - rotation @ a["t"]}
+    pair |= {f"{key}{first + i}": x[k] for i, x in enumerate((a, b)) for key, k in (("M", "K"), ("D", "D"))}
     more = {"R1": np.eye(3), "R2": np.eye(3), "P1": np.eye(3, 4), "P2": np.eye(3, 4), "Q": np.eye(4)}
     write_opencv(path, {**pair, **more} if rectified else pair)
-    first, second = import_cameras(path)
+    left, right = import_cameras(path)
     world = POINTS @ ONE.rotation.T + ONE.translation  # the first camera is the world
-    assert torch.allclose(first.camera((160, 200), PLANE).project(world), ONE.project(POINTS))
-    assert torch.allclose(second.camera((160, 200), PLANE).project(world), TWO.project(POINTS))
+    assert torch.allclose(left.camera((160, 200), PLANE).project(world), ONE.project(POINTS))
+    assert torch.allclose(right.camera((160, 200), PLANE).project(world), TWO.project(POINTS))
 
 
 @pytest.mark.parametrize(
@@ -435,6 +445,7 @@ def test_opencv_stereo_pair(tmp_path, rectified):
         ({"R": None, "t": None}, "bad.yml: camera 1: no pose"),
         ({"D": np.arange(8.0)}, "at most 5 distortion coefficients"),
         ({"K": None}, "no camera matrix"),
+        ({"R": np.array([0.0, 30.0, 0.0])}, "bad.yml: camera 1: expected a rotation vector in rad"),
         ({"R": np.diag([-1.0, 1, 1]) @ arrays(ONE)["R"]}, "bad.yml: rotation of view 'bad'"),
         ({"image_width": np.ones((2, 2)), "image_height": 160}, "image_size: expected 2 numbers"),
         ({"xi": np.ones((1, 1))}, "undistort the images"),

@@ -17,7 +17,7 @@ from nerif.geometry.body import UNITS, Body
 __all__ = ["FORMATS", "read_body"]
 
 FORMATS = (".stl", ".obj", ".ply")
-SAME = 1e6  # parts of the size, to which vertices are rounded to be the same: STL has single precision
+SAME = 1e-5  # of the size, within which vertices are one: STL has single precision, and programs round
 
 
 def read_body(
@@ -56,6 +56,9 @@ def read_body(
 def _triangles(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Vertices and triangles of a file; vertices at the same place are one, triangles without area are left out."""
     import trimesh
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import cKDTree
 
     try:
         mesh: Any = trimesh.load(path, force="mesh", process=False, skip_materials=True)
@@ -68,8 +71,10 @@ def _triangles(path: Path) -> tuple[np.ndarray, np.ndarray]:
     if not np.isfinite(vertices).all():
         raise InputError("expected finite vertices, got NaN or infinity", field=path)
     size = float(np.ptp(vertices, axis=0).max()) or 1.0
-    rounded = np.round(vertices / size * SAME)
-    _, first, index = np.unique(rounded, axis=0, return_index=True, return_inverse=True)
-    faces = index.ravel()[faces]
+    vertices, index = np.unique(vertices, axis=0, return_inverse=True)
+    near = cKDTree(vertices).query_pairs(SAME * size, output_type="ndarray").T
+    _, group = connected_components(coo_array((np.ones(near.shape[1]), near), (len(vertices),) * 2), directed=False)
+    _, first = np.unique(group, return_index=True)
+    faces = group[index.ravel()[faces]]
     a, b, c = faces.T
     return vertices[first], np.ascontiguousarray(faces[(a != b) & (b != c) & (c != a)])

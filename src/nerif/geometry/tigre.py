@@ -35,6 +35,7 @@ from nerif.geometry.grid import Grid
 __all__ = ["from_tigre", "tigre_of"]
 
 MOST = 0.1  # px, by which a common pixel size may move a pixel
+TURN = 2 * math.pi * (1 + 1e-6)  # rad, beyond which angles are likely in degrees
 LEAST = 1e-6  # px, below which pixels count as exact
 
 
@@ -136,8 +137,18 @@ def from_tigre(geometry: Mapping[str, Any]) -> tuple[Float[Tensor, "view 12"], t
     if bool(values("COR", 1, 0.0).any()):
         raise InputError("expected a centre of rotation of 0, got another; put it into offDetector", field="COR")
     source, detector = values("DSO", 1), values("DSD", 1)
+    if not bool(((source > 0) & (detector > source)).all()):
+        got = f"{source.flatten().tolist()[:3]} and {detector.flatten().tolist()[:3]}"
+        raise InputError(f"expected 0 < DSO (source to origin) < DSD (source to detector), mm, got {got}", field="DSD")
     (dv, du), (rows, columns) = (np.asarray(geometry[key]).ravel()[:2].tolist() for key in ("dDetector", "nDetector"))
     off, turns, origin = values("offDetector", 2, 0.0), values("rotDetector", 3, 0.0), values("origin_mm", 3, 0.0)
+    for key, array in (("angles", angles), ("rotDetector", turns.numpy())):
+        if not (np.abs(array) <= TURN).all():
+            raise InputError(
+                f"expected rad, within one turn, got up to {np.abs(array).max():g}; if they are in degrees, take "
+                "numpy.deg2rad of them, else their remainder by 2 pi",
+                field=key,
+            )
     vectors = []
     for i, (alpha, theta, psi) in enumerate(angles.tolist()):
         frame = _z(alpha) @ _y(theta) @ _z(psi)

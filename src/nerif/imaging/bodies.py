@@ -18,12 +18,13 @@ from nerif.geometry.body import Body, check_place, hidden_pixels, orientations
 from nerif.geometry.pose import rotation_matrix
 from nerif.imaging.silhouettes import refine_pose
 
-__all__ = ["film_with_bodies", "read_poses", "with_bodies", "without_bodies"]
+__all__ = ["check_size", "film_with_bodies", "read_poses", "with_bodies", "without_bodies"]
 
 POSE_COLUMNS = ("rx", "ry", "rz", "tx", "ty", "tz")
 
 FITS, FITS_NOT = 0.7, 0.4  # overlap of hidden pixels and those without data, of which one place is taken for another
 COMPARED = 48  # pixels along an image that are compared
+SMALL = 0.01  # of the pixels of an image, below which a body is likely larger
 FEW = 0.002  # of the pixels, below which those without data show no body
 
 
@@ -46,13 +47,32 @@ def with_bodies(
         mirrored or with other axes.
     """
     for body in bodies:
-        check_place(body, measurement.box, unit_stated)
+        check_size(measurement, body, unit_stated or body in measurement.bodies)
         _check_silhouette(measurement, body)
     each = _hidden(measurement, bodies, margin, on_view)
     for body, hidden in zip(bodies, each, strict=True):
         if not bool(hidden.any()):
             raise InputError("no pixel sees it; check its place, and that the views show it", field=body.name)
     return _hide(measurement, bodies, each)
+
+
+def check_size(measurement: Measurement, body: Body, unit_stated: bool = False) -> None:
+    """Raise an InputError for a body that is not in the box, or whose unit of length is likely another.
+
+    Parameters
+    ----------
+    unit_stated : whether the user stated the unit of its lengths, so that a small body is meant
+    """
+    check_place(body, measurement.box, unit_stated)
+    step = _step(measurement)
+    largest = max(float(hidden_pixels(c, [body], step=step).double().mean()) for c in measurement.cameras)
+    if 0 < largest < SMALL and not unit_stated:
+        size = " x ".join(f"{e:.3g}" for e in (body.extent[1] - body.extent[0]).tolist())
+        raise InputError(
+            f"expected a body that hides {SMALL:.0%} of an image or more, got {largest:.2%} by one of {size} mm; are its "
+            "lengths in cm, in or m (--unit)? If it is that small, state --unit mm",
+            field=body.name,
+        )
 
 
 def _hidden(
@@ -170,10 +190,14 @@ def without_bodies(measurement: Measurement) -> Measurement:
     return replace(measurement, bodies=(), hidden=None, valid=valid)
 
 
+def _step(measurement: Measurement) -> int:
+    """Step in px at which images are compared."""
+    return max(1, max(max(camera.image_size) for camera in measurement.cameras) // COMPARED)
+
+
 def _check_silhouette(measurement: Measurement, body: Body) -> None:
     """Raise an error if pixels without data show the body elsewhere than it is."""
-    step = max(1, max(max(camera.image_size) for camera in measurement.cameras) // COMPARED)
-    usable = measurement.usable
+    step, usable = _step(measurement), measurement.usable
     empty = [
         ~usable[i, : camera.image_size[0] : step, : camera.image_size[1] : step]
         for i, camera in enumerate(measurement.cameras)

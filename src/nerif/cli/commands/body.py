@@ -19,9 +19,9 @@ from nerif.common.locks import locked
 from nerif.data.body_file import read_body
 from nerif.data.measurement import Measurement
 from nerif.data.measurement_sequence import MeasurementSequence
-from nerif.geometry.body import Body, check_place
+from nerif.geometry.body import Body
 from nerif.geometry.pose import rotation_matrix
-from nerif.imaging.bodies import film_with_bodies, read_poses, with_bodies, without_bodies
+from nerif.imaging.bodies import check_size, film_with_bodies, read_poses, with_bodies, without_bodies
 from nerif.imaging.masks import drawn_masks
 from nerif.imaging.silhouettes import drawn_silhouettes, hull_of_silhouettes, refine_pose
 
@@ -143,7 +143,7 @@ def _bodies(settings: BodyInFlow, measurement: Measurement) -> list[Body]:
         read = read_body(path, settings.unit or "mm", lambda line: say(f"note: {line}"))
         body = read.moved(rotation, translation)
         if settings.refine and settings.measurement.suffix != ".zarr":
-            check_place(body, measurement.box, settings.unit is not None)
+            check_size(measurement, body, settings.unit is not None)
             pose = refine_pose(measurement, body, silhouettes, 0 if silhouettes is not None else settings.margin)
             say(pose.sentence)
             body = pose.body

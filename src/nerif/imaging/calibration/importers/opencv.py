@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -24,7 +25,6 @@ KEYS = {
 SIZES = (("image_height", "image_width"), ("Image_Height", "Image_Width"), ("height", "width"))
 MODELS = ("camera_model", "distortion_model", "calibration_model")
 OTHER_MODELS = ("fisheye_model", "xi")  # a flag of OpenCV's calibration program; a parameter of omnidirectional cameras
-MAX_CAMERAS = 32  # in one file
 INTRINSICS, EXTRINSICS = "intrinsics", "extrinsics"
 PARTNER = {INTRINSICS: EXTRINSICS, EXTRINSICS: INTRINSICS}
 CONTENT = {INTRINSICS: "the camera matrices M1, D1, M2, D2", EXTRINSICS: "the pose R, T of the second camera"}
@@ -103,7 +103,7 @@ def _key(values: dict[str, Any], quantity: str, suffix: str = "") -> str:
 
 
 def _cameras(path: Path, values: dict[str, Any]) -> list[CalibratedCamera]:
-    """Return one camera, several with numbered keys (K1, D1, R1, T1, K2 ...), or a stereo pair with one R and T."""
+    """Return one camera, several with numbered keys (K0, D0, R0, T0, K1 ...), or a stereo pair with one R and T."""
     import cv2
 
     for key in MODELS:
@@ -116,7 +116,9 @@ def _cameras(path: Path, values: dict[str, Any]) -> list[CalibratedCamera]:
     def find(quantity: str, suffix: str) -> Any:
         return values.get(_key(values, quantity, suffix))
 
-    suffixes = [s for s in ("", *map(str, range(1, MAX_CAMERAS + 1))) if find("intrinsics", s) is not None]
+    words = "|".join(KEYS["intrinsics"])
+    numbered = (re.fullmatch(rf"(?:{words})(_?\d+|)", key) for key, value in values.items() if value is not None)
+    suffixes = sorted({match[1] for match in numbered if match}, key=lambda s: int(s.strip("_") or -1))
     if not suffixes:
         raise InputError(
             f"no camera matrix; expected {', '.join(KEYS['intrinsics'])} (with a number appended for "
@@ -128,13 +130,14 @@ def _cameras(path: Path, values: dict[str, Any]) -> list[CalibratedCamera]:
     )
     sizes = ([values.get(key) for key in pair] for pair in SIZES)
     size = next((pair for pair in sizes if all(x is not None for x in pair)), None)
-    stereo = suffixes == ["1", "2"] and find("translation", "2") is None  # R1 and R2 may be stereoRectify's
+    # R1 and R2 may be stereoRectify's
+    stereo = len(suffixes) == 2 and "" not in suffixes and find("translation", suffixes[1]) is None
     cameras = []
     rotation: Any
     translation: Any
     for suffix in suffixes:
         where = f"{path}: camera {suffix or 1}"
-        if stereo and suffix == "1":  # the first camera is the world, x2 = R x1 + T
+        if stereo and suffix == suffixes[0]:  # the first camera is the world, x2 = R x1 + T
             rotation, translation = np.eye(3), np.zeros(3)
         else:
             rotation, translation = (find(q, "" if stereo else suffix) for q in ("rotation", "translation"))
@@ -145,8 +148,10 @@ def _cameras(path: Path, values: dict[str, Any]) -> list[CalibratedCamera]:
                 field=where,
             )
         if np.size(rotation) == 3:
+            if np.linalg.norm(flat(rotation, f"{where}: rotation")) > 2 * np.pi:
+                raise InputError(f"expected a rotation vector in rad, got {np.ravel(rotation)}", field=where)
             rotation = cv2.Rodrigues(flat(rotation, f"{where}: rotation"))[0]
-        name = f"cam{suffix}" if suffix else path.stem
+        name = f"cam{suffix.strip('_')}" if suffix else path.stem
         intrinsics, distortion = find("intrinsics", suffix), find("distortion", suffix)
         cameras.append(CalibratedCamera.from_values(where, name, intrinsics, rotation, translation, distortion, size))
     return cameras
