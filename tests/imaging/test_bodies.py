@@ -94,7 +94,7 @@ def test_a_body_in_the_wrong_place_is_refused(flow):
 def test_a_body_in_inches_or_cm_is_refused_unless_its_unit_is_stated(flow, factor):
     """A ball of 12 mm in a box of 40; as for metres."""
     small = ball(6.0 * factor, name="model")
-    with pytest.raises(InputError, match="model: .* got 0.39% by one of .* lengths in cm, in or m .* --unit mm"):
+    with pytest.raises(InputError, match=r"model: .* got 0.39% by one of .* lengths in cm, in or m .* --unit mm"):
         with_bodies(flow, [small])
     placed = with_bodies(flow, [small], unit_stated=True)
     assert len(with_bodies(placed, [*placed.bodies, ball(6.0, (8.0, 0.0, 0.0))]).bodies) == 2

@@ -69,8 +69,8 @@ def check_size(measurement: Measurement, body: Body, unit_stated: bool = False) 
     if 0 < largest < SMALL and not unit_stated:
         size = " x ".join(f"{e:.3g}" for e in (body.extent[1] - body.extent[0]).tolist())
         raise InputError(
-            f"expected a body that hides {SMALL:.0%} of an image or more, got {largest:.2%} by one of {size} mm; are its "
-            "lengths in cm, in or m (--unit)? If it is that small, state --unit mm",
+            f"expected a body that hides {SMALL:.0%} of an image or more, got {largest:.2%} by one of {size} mm; are "
+            "its lengths in cm, in or m (--unit)? If it is that small, state --unit mm",
             field=body.name,
         )
 

@@ -426,6 +426,33 @@ job_script_prologue: ["source ~/nerif/bin/activate"]
 """
 
 
+def commands(folder: Path, monkeypatch: pytest.MonkeyPatch, script: str) -> None:
+    """Put sbatch and scancel of one shell script first on the path, and nothing else if it is empty."""
+    (folder / "bin").mkdir()
+    for name in ("sbatch", "scancel") if script else ():
+        (folder / "bin" / name).write_text(f"#!/bin/sh\n{script}\n")
+        (folder / "bin" / name).chmod(0o755)
+    monkeypatch.setenv("PATH", str(folder / "bin"), prepend=":" if script else None)
+
+
+@pytest.mark.parametrize(
+    ("script", "words"),
+    [
+        ("", "cluster: no command sbatch here; start nerif on a login node"),
+        ("echo error: invalid partition >&2; exit 1", r"cluster: sbatch refused the job \(error: invalid partition\)"),
+        ("echo no number", "cluster: sbatch refused the job .*no number"),
+    ],
+)
+def test_jobs_that_cannot_be_submitted_end_the_command(script, words, tmp_path, monkeypatch, capfd):
+    pytest.importorskip("dask_jobqueue", reason="pip install '.[cluster]'")
+    file = tmp_path / "slurm.yaml"
+    file.write_text(SLURM)
+    commands(tmp_path, monkeypatch, script)
+    with pytest.raises(InputError, match=words), open_cluster(str(file), shared=tmp_path):
+        pass
+    assert "Traceback" not in capfd.readouterr().err
+
+
 def test_the_job_script_of_slurm_asks_for_what_the_file_says(tmp_path, monkeypatch):
     pytest.importorskip("dask_jobqueue", reason="pip install '.[cluster]'")
     file = tmp_path / "slurm.yaml"
@@ -435,12 +462,14 @@ def test_the_job_script_of_slurm_asks_for_what_the_file_says(tmp_path, monkeypat
     with pytest.raises(InputError, match="jobs: expected"), slurm_cluster(file):
         pass
     file.write_text(SLURM)
-    monkeypatch.setattr("dask_jobqueue.SLURMCluster.scale", lambda self, jobs: None)  # sbatch is not to be run
+    commands(tmp_path, monkeypatch, "echo Submitted batch job $$; echo x >> $0.log")
     with slurm_cluster(file, tmp_path) as jobs:
         script = jobs.job_script()
         (folder,) = tmp_path.glob(".nerif-*")
         modes = [stat.S_IMODE(path.stat().st_mode) for path in (folder, folder / "key.pem")]
         assert jobs.scheduler_address.startswith("tls://")
+        assert len((tmp_path / "bin" / "sbatch.log").read_text().split()) == 4
+    assert len((tmp_path / "bin" / "scancel.log").read_text().split()) == 4
     for line in ("#SBATCH -p gpu", "#SBATCH --cpus-per-task=8", "#SBATCH -t 02:00:00", "#SBATCH --gres=gpu:1"):
         assert line in script
     assert "--nthreads 1" in script
@@ -463,7 +492,18 @@ def test_the_job_script_of_slurm_asks_for_what_the_file_says(tmp_path, monkeypat
     [
         ("cores: [", "not a YAML file"),
         ("- 1", "expected names and values"),
-        ("cores: 1\nmemory: 1GB\njob_script_prologue: module load x", "expected a list of shell lines"),
+        ("cores: 1\nmemory: 1GB\njob_script_prologue: module load x", "expected e.g. .'source ~.*got 'module load x'"),
+        ("cores: 1\nmemory: 1GB\njob_extra_directives: --gres=gpu:1", "job_extra_directives: expected e.g. "),
+        ("cores: 1\nmemory: 1GB\njob_extra_directives: [1]", "job_extra_directives: expected e.g. "),
+        ("cores: [8]\nmemory: 1GB", r"cores: expected e.g. 8, got \[8\]"),
+        ("cores: 1.5\nmemory: 1GB", "cores: expected e.g. 8, got 1.5"),
+        ("cores: true\nmemory: 1GB", "cores: expected e.g. 8, got True"),
+        ("cores: 1\nmemory: [1GB]", "memory: expected e.g. '32GB'"),
+        ("cores: 1\nmemory: 1GB\nprocesses: {a: 1}", "processes: expected e.g. 1"),
+        ("cores: 1\nmemory: 1GB\njobs: [4]", "jobs: expected e.g. 4"),
+        ("cores: 1\nmemory: 1GB\nqueue: [gpu]", "queue: expected a text or a number"),
+        ("cores: 1\nmemory: 1GB\nwalltime: 10:00:00", "walltime: expected e.g. '02:00:00', got 36000"),
+        ("cores: 1\nmemory: much", "memory: Could not interpret 'much'"),
         ("cores: 4", "expected 'memory' of a job"),
         ("cores: 1\nmemory: 1GB\nscheduler_options: eth0", "scheduler_options: expected e.g. {'host': '10.0.0.1'}"),
         ("cores: 4\nmemory: 8GB\nqueu: x", "unknown key 'queu'; the nearest known one is 'queue'"),

@@ -43,6 +43,13 @@ JOB_PROLOGUE = [
     "trap 'rm -rf \"$DASK_TEMPORARY_DIRECTORY\"' EXIT",
 ]
 """Shell lines of a job, which does not inherit the configuration of the command."""
+EXAMPLES: dict[str, Any] = {
+    "jobs": 4, "cores": 8, "processes": 1, "job_cpu": 8, "memory": "32GB", "walltime": "02:00:00",
+    "job_script_prologue": ["source ~/nerif/bin/activate"], "job_extra_directives": ["--gres=gpu:1"],
+    "job_directives_skip": ["-t"], "worker_extra_args": ["--lifetime", "55m"],
+    "scheduler_options": {"host": "10.0.0.1"},
+}  # fmt: skip
+"""Settings of SLURM; others are texts, numbers, or true and false. YAML reads 10:00:00 without quotes as a number."""
 PROTOCOLS = ("tcp://", "tls://", "ucx://", "ws://", "wss://")
 
 
@@ -185,16 +192,13 @@ def slurm_cluster(path: Path, shared: Path | None = None, dashboard: bool = Fals
     """
     settings = {"shared_temp_directory": shared or Path.cwd(), **read_slurm(path)}
     jobs = settings.pop("jobs", 1)
-    if not isinstance(jobs, int) or jobs < 1:
-        raise InputError(f"jobs: expected 1 or more, got {jobs!r}", field=path)
     try:
         from dask_jobqueue import SLURMCluster
     except ImportError:
         raise InputError(f"dask-jobqueue is not installed; {install('cluster')}", field="cluster") from None
     check_known(settings, _slurm_names(), str(path), more="; see docs/sequences.md")
     http = f"{LOOPBACK}:0"
-    options = _site_setting(path, settings, "scheduler_options", {"host": "10.0.0.1"})
-    words = _site_setting(path, settings, "worker_extra_args", ["--lifetime", "55m"])
+    options, words = (_site_setting(path, settings, name) for name in ("scheduler_options", "worker_extra_args"))
     settings |= {
         "scheduler_options": {"dashboard": dashboard, "dashboard_address": http, **options},
         "worker_extra_args": [*words, "--no-dashboard", "--dashboard-address", http],
@@ -203,18 +207,48 @@ def slurm_cluster(path: Path, shared: Path | None = None, dashboard: bool = Fals
         _certificate_files(Path(settings["shared_temp_directory"])) as security,
         SLURMCluster(**settings, security=security) as cluster,
     ):
-        cluster.scale(jobs=jobs)
+        cluster.sync(_submit, cluster, jobs)
         yield cluster
 
 
-def _site_setting(path: Path, settings: dict[str, Any], name: str, example: Any) -> Any:
-    """Return a setting of the file, or of Dask's own configuration of SLURM, of the type of the example."""
+async def _submit(cluster: Any, jobs: int) -> None:
+    """Submit jobs; Dask's own `scale` leaves errors of sbatch to the log, and the command would wait without end."""
+    from distributed.core import Status
+
+    for _ in range(jobs):
+        cluster.worker_spec.update(cluster.new_worker_spec())
+    try:
+        await cluster
+    except (OSError, RuntimeError, ValueError) as error:
+        for job in cluster.workers.values():
+            if job.job_id is None:
+                job.status = Status.failed  # without it, Dask refuses to close the cluster
+        reason = " ".join((str(error).partition("stderr:")[2].strip() or str(error)).split())
+        text = f"sbatch refused the job ({reason})"
+        if isinstance(error, FileNotFoundError):
+            text = "no command sbatch here; start nerif on a login node of SLURM"
+        raise InputError(text, field="cluster") from None
+
+
+def _site_setting(path: Path, settings: dict[str, Any], name: str) -> Any:
+    """Return a setting of the file, or of Dask's own configuration of SLURM, or an empty one."""
     import dask
 
-    value = settings.get(name) or dask.config.get(f"jobqueue.slurm.{name.replace('_', '-')}", None) or type(example)()
-    if not isinstance(value, type(example)):
-        raise InputError(f"{name}: expected e.g. {example}, got {value!r}", field=path)
-    return value
+    value = settings.get(name) or dask.config.get(f"jobqueue.slurm.{name.replace('_', '-')}", None)
+    _check_setting(path, name, value)
+    return value or type(EXAMPLES[name])()
+
+
+def _check_setting(path: Path, name: str, value: Any) -> None:
+    """Refuse a value of another type than that of the setting."""
+    example = EXAMPLES.get(name, "text")
+    kinds = (type(example),) if name in EXAMPLES else (str, int, float)
+    valid = isinstance(value, kinds) and not (isinstance(example, int) and (value is True or value < 1))
+    if isinstance(example, list):
+        valid &= all(isinstance(entry, str) for entry in value)
+    if not valid and value is not None:
+        expected = f"e.g. {example!r}" if name in EXAMPLES else "a text or a number"
+        raise InputError(f"{name}: expected {expected}, got {value!r}", field=path)
 
 
 def _slurm_names() -> list[str]:
@@ -229,6 +263,8 @@ def _slurm_names() -> list[str]:
 
 def read_slurm(path: Path) -> dict[str, Any]:
     """Read the settings of a SLURM cluster, by default with one process and one thread per job."""
+    from dask.utils import parse_bytes
+
     if not path.is_file():
         raise InputError(f"expected local, tcp://HOST:PORT or a YAML file for SLURM, got '{path}'", field="cluster")
     content = read_yaml(path)
@@ -236,14 +272,15 @@ def read_slurm(path: Path) -> dict[str, Any]:
         raise InputError(f"expected names and values such as 'queue: gpu', got {type(content).__name__}", field=path)
     settings = {str(k).replace("-", "_"): v for k, v in content.items()}
     for name, example in (("cores", "8"), ("memory", "32GB")):
-        if name not in settings:
+        if settings.get(name) is None:
             raise InputError(f"expected '{name}' of a job, e.g. '{name}: {example}'", field=path)
+    for name, value in settings.items():
+        _check_setting(path, name, value)
+    try:
+        parse_bytes(settings["memory"])
+    except ValueError as error:
+        raise InputError(f"memory: {error}", field=path) from None
     prologue = settings.get("job_script_prologue") or []
-    if not isinstance(prologue, list):
-        raise InputError(
-            f'job_script_prologue: expected a list of shell lines, ["source ~/nerif/bin/activate"], got {prologue!r}',
-            field=path,
-        )
     # a job is one worker that reconstructs one chunk at a time on all its cores
     settings = {"processes": 1, "job_cpu": settings["cores"], **settings, "cores": 1}
     return settings | {"job_script_prologue": [*JOB_PROLOGUE, *prologue]}
