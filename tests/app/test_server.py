@@ -105,6 +105,73 @@ def test_the_websocket_too(server):
     assert " 101" in upgrade(server, cookie, f"Origin: http://127.0.0.1:{server.port}")
 
 
+HUB, ROOT = "hub.example.org", "/user/me%40b/proxy/8620"
+
+
+@pytest.fixture(scope="module")
+def proxied(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    """A server behind JupyterHub's proxy, and at the end of a tunnel."""
+    options = ["--allowed-host", "localhost:9000", "--allowed-host", HUB, "--root-path", f"{ROOT}/"]
+    with served(tmp_path_factory.mktemp("project"), *options) as server:
+        yield server
+
+
+@pytest.mark.parametrize("inside", ["", ROOT, ROOT.replace("%40", "@")])
+@pytest.mark.parametrize("host", [HUB, "localhost:9000", ""])
+def test_a_tunnel_and_a_proxy_that_removes_or_keeps_its_path(proxied, host, inside):
+    """jupyter-server-proxy passes the browser's Host and Origin on, and states its path besides."""
+    own = {"Host": host or f"127.0.0.1:{proxied.port}", "X-Forwarded-Prefix": ROOT}
+    status, headers, _ = proxied.get(f"{inside}/?token={proxied.token}", own)
+    assert (status, headers["refresh"]) == (200, f"0; url={ROOT}/")
+    assert f"Path={ROOT};" in headers["set-cookie"] + ";"
+    own |= {"Cookie": headers["set-cookie"].partition(";")[0], "Origin": f"https://{own['Host']}"}
+    status, headers, _ = proxied.get(f"{inside}/", own)
+    assert (status, headers["location"]) == (307, "design")
+    status, _, page = proxied.get(f"{inside}/design", own)
+    assert status == 200
+    assert f'src="{ROOT}{STATIC.rpartition("/")[0]}/nicegui.js"' in page
+    assert ROOT + ROOT not in page
+    assert proxied.get(inside + STATIC, own)[0] == proxied.get(inside + SOCKET, own)[0] == 200
+    assert "href='results'" in page.replace("\\u003E", ">").replace("\\", "")
+    assert " 101" in upgrade(proxied, f"Cookie: {own['Cookie']}", f"Origin: {own['Origin']}")
+
+
+def test_an_allowed_host_admits_no_other(proxied):
+    cookie = proxied.get("/?token=" + proxied.token)[1]["set-cookie"].partition(";")[0]
+    for host in ("hub.example.org:8443", "hub.example.org.evil.example", "localhost:9001", "localhost", "evil.example"):
+        assert proxied.get("/design", {"Host": host, "Cookie": cookie})[0] == 421
+        for scheme in ("http", "https"):
+            assert proxied.get("/design", {"Host": HUB, "Origin": f"{scheme}://{host}", "Cookie": cookie})[0] == 403
+    assert proxied.get("/design", {"Host": HUB})[0] == 403
+    assert proxied.get("/design", {"Host": HUB, "Cookie": cookie, "X-Forwarded-Prefix": "//evil"})[0] == 200
+    assert "evil" not in proxied.get("/design", {"Host": HUB, "Cookie": cookie, "X-Forwarded-Prefix": "//evil"})[2]
+
+
+def test_a_refused_address_names_the_option_and_the_token(server):
+    text = server.get("/design", {"Host": "localhost:9000", "Cookie": server.cookie()})[2]
+    assert "address of this server: localhost:9000. If that is a tunnel or proxy" in text
+    assert "--allowed-host localhost:9000 (and --root-path" in text
+    own = {"Host": f"127.0.0.1:{server.port}", "Cookie": server.cookie()}
+    assert "--allowed-host hub.example.org " in server.get("/design", {**own, "Origin": "https://hub.example.org"})[2]
+    assert "/?token=..." in server.get("/design")[2]
+    for strange in ("<b>x</b>", "a b", "x;rm", "h:port"):
+        assert server.get("/design", {"Host": strange})[::2] == (421, "This is not an address of this server.")
+
+
+@pytest.mark.parametrize(
+    ("words", "field"),
+    [
+        ("--allowed-host https://hub.example.org", "allowed_host"), ("--allowed-host *", "allowed_host"),
+        ("--allowed-host hub.example.org/user", "allowed_host"), ("--root-path user/me", "root_path"),
+        ("--root-path //evil.example", "root_path"), ("--root-path /a?b", "root_path"),
+        ("--root-path /<b>", "root_path"),
+    ],
+)  # fmt: skip
+def test_addresses_that_are_none_are_refused(tmp_path, words, field):
+    with pytest.raises(InputError, match=f"^{field}: expected"):
+        read_settings(App(), [str(tmp_path), *words.split()], "app")
+
+
 def test_it_listens_on_this_machine_alone(server):
     with socket.socket() as probe:
         own = socket.gethostbyname(socket.gethostname())
@@ -209,6 +276,14 @@ def test_a_browser_is_let_in_by_way_of_the_page(browser, server):
         browser.get(page)
         wait_for(browser, "return location.pathname === '/design' && window.socket?.connected")
     assert server.token not in browser.current_url
+
+
+@needs_browser
+def test_pages_below_the_path_of_a_proxy_lead_to_one_another(browser, proxied):
+    browser.get(f"http://127.0.0.1:{proxied.port}{ROOT}/?token={proxied.token}")
+    wait_for(browser, f"return location.pathname === '{ROOT}/design' && window.socket?.connected")
+    browser.execute_script("document.querySelector(\"nav a[href='results']\").click()")
+    wait_for(browser, f"return location.pathname === '{ROOT}/results' && window.socket?.connected")
 
 
 @pytest.mark.parametrize(("error", "shown"), [("No response returned.", False), ("out of tune", True)])

@@ -10,6 +10,7 @@ from typing import Annotated
 
 import tyro
 
+from nerif.app.guard import ADDRESS
 from nerif.cli.commands.settings import Settings, read_settings
 from nerif.common.conventions import InputError
 from nerif.common.installation import install
@@ -38,12 +39,27 @@ class App(Settings):
     token: str | None = None
     """Token in the address, 16 characters or more; without it a new random one at each start. Other users of this
     machine can read the command line: set the token in a --config file that they cannot read."""
+    allowed_host: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """Address of a tunnel or proxy of yours that leads here, with its port, as the browser shows it: localhost:9000,
+    hub.example.org. Once for each; all others are refused."""
+    root_path: str = ""
+    """Path that a proxy puts in front, such as /user/me/proxy/8620 of JupyterHub."""
     browser: bool = True
     """Open the browser."""
 
     def __post_init__(self) -> None:
         if not 1 <= self.port <= 65535:
             raise InputError(f"expected 1 to 65535, got {self.port}", field="port")
+        for address in self.allowed_host:
+            if not ADDRESS.fullmatch(address):
+                raise InputError(
+                    f"expected HOST or HOST:PORT as the browser shows it, such as localhost:9000, got '{address}'",
+                    field="allowed_host",
+                )
+        if self.root_path and not re.fullmatch(r"(/[\w.~@%+-]+)+/?", self.root_path, re.ASCII):
+            raise InputError(
+                f"expected a path such as /user/me/proxy/8620, got '{self.root_path}'", field="root_path"
+            )
         if self.token is not None and not re.fullmatch(r"[\w.~-]{16,}", self.token, re.ASCII):
             raise InputError(
                 f"expected 16 or more of A-Z a-z 0-9 _ . ~ -, got {len(self.token)} characters", field="token"
@@ -56,7 +72,9 @@ def run(settings: App) -> None:
         raise InputError(f"expected NiceGUI, which is not installed; {install('app')}", field="app")
     from nerif.app.server import Address, serve
 
-    address = Address.of(settings.host, settings.port, settings.token)
+    address = Address.of(
+        settings.host, settings.port, settings.token, settings.allowed_host, settings.root_path.rstrip("/")
+    )
     folder = settings.folder or Path(".")
     if settings.demo:
         from nerif.app.demo import FOLDER, fill

@@ -65,7 +65,7 @@ def frame(work: Workspace, page: Page, pages: Sequence[Page]) -> Iterator[None]:
     with ui.left_drawer(value=None, bordered=True).props("width=208 breakpoint=900").classes("side") as left:
         menu.on_click(left.toggle)
         links = "".join(
-            f"<li><a href='{p.path}'{' aria-current=page' if p is page else ''}>"
+            f"<li><a href='{p.path[1:]}'{' aria-current=page' if p is page else ''}>"
             f"<span class=number>{i}</span>{escape(p.title)}</a></li>"
             for i, p in enumerate(pages, start=1)
         )

@@ -78,7 +78,7 @@ class GuideView:
         """Show the state of the step as it is now."""
         sentence, word, page = await self.work.in_thread(state, self.work, self.page, self.pages)
         kind = "next" if sentence == OPEN else "next ready"
-        link = f'<a class="{kind}" href="{page.path}">{word} {escape(page.title)}</a>' if page else ""
+        link = f'<a class="{kind}" href="{page.path[1:]}">{word} {escape(page.title)}</a>' if page else ""
         self.link.set_content(link)
         self.status.set_content(escape(sentence))
 

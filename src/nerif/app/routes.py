@@ -1,6 +1,7 @@
 """Responses of the server other than pages: reports and isosurfaces.
 
-A report may come from another machine, so it is sandboxed and cannot reach this server.
+A report may come from another machine, so it is sandboxed and cannot reach this server. Addresses are relative to the
+pages, which a proxy may put below a path.
 """
 
 from __future__ import annotations
@@ -42,23 +43,23 @@ def report_file(path: Path) -> Path:
 
 def report_address(name: str, stamp: int) -> str:
     """Return the address of a report; `stamp` changes with its file."""
-    return "/report?" + urlencode({"of": name, "stamp": stamp}, quote_via=quote)
+    return "report?" + urlencode({"of": name, "stamp": stamp}, quote_via=quote)
 
 
 def surface_address(name: str, quantity: str, level: float, frame: int, stamp: int) -> str:
     """Return the address of an isosurface."""
     query = {"of": name, "quantity": quantity, "level": repr(level), "frame": frame, "stamp": stamp}
-    return "/surface?" + urlencode(query, quote_via=quote)
+    return "surface?" + urlencode(query, quote_via=quote)
 
 
 def bodies_address(name: str, stamp: int) -> str:
     """Return the address of the surface of the bodies in the flow of a result."""
-    return "/bodies?" + urlencode({"of": name, "stamp": stamp}, quote_via=quote)
+    return "bodies?" + urlencode({"of": name, "stamp": stamp}, quote_via=quote)
 
 
 def live_address(name: str, stamp: int) -> str:
     """Return the address of the isosurface of the last preview of a run."""
-    return "/live-surface?" + urlencode({"of": name, "stamp": stamp}, quote_via=quote)
+    return "live-surface?" + urlencode({"of": name, "stamp": stamp}, quote_via=quote)
 
 
 def _report(work: Workspace, query: Mapping[str, str]) -> Response:

@@ -47,14 +47,20 @@ class Address:
     host : name or IP address to listen on
     port : port to listen on
     token : token that a browser must send
+    allowed : addresses of tunnels and proxies that lead to the server
+    root : path that a proxy puts in front
     """
 
     host: str
     port: int
     token: str
+    allowed: tuple[str, ...] = ()
+    root: str = ""
 
     @classmethod
-    def of(cls, host: str, port: int, token: str | None) -> Address:
+    def of(
+        cls, host: str, port: int, token: str | None, allowed: tuple[str, ...] = (), root: str = ""
+    ) -> Address:  # fmt: skip
         """Return an address with a free port; a host that others can reach needs a token, else it is random."""
         if not _is_local(host):
             if token is None:
@@ -68,7 +74,7 @@ class Address:
         free = _free_port(host, port)
         if free != port:
             say(f"port {port} is in use; using {free}")
-        return cls(host, free, token or secrets.token_urlsafe(24))
+        return cls(host, free, token or secrets.token_urlsafe(24), allowed, root)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -84,7 +90,12 @@ class Address:
     def link(self) -> str:
         """The address to open."""
         host = socket.gethostname() if self.host in EVERYWHERE else self.host
-        return f"http://{f'[{host}]' if ':' in host else host}:{self.port}/?{urlencode({'token': self.token})}"
+        return f"http://{f'[{host}]' if ':' in host else host}:{self.port}/{self.query}"
+
+    @property
+    def query(self) -> str:
+        """The token as the end of an address."""
+        return f"?{urlencode({'token': self.token})}"
 
 
 def serve(folder: Path, address: Address, browser: bool = True) -> None:
@@ -93,8 +104,11 @@ def serve(folder: Path, address: Address, browser: bool = True) -> None:
     if not work.project.writable:
         say(f"note: {READ_ONLY}")
     logging.getLogger("uvicorn.error").addFilter(is_relevant)
-    app.add_middleware(Guard, token=address.token, hosts=address.names, port=address.port)
-    app.add_api_route("/", lambda: RedirectResponse(_first(work.project).path), include_in_schema=False)
+    app.add_middleware(
+        Guard, token=address.token, hosts=address.names, port=address.port, allowed=address.allowed,
+        root=address.root, say=say,
+    )  # fmt: skip
+    app.add_api_route("/", lambda: RedirectResponse(_first(work.project).path[1:]), include_in_schema=False)
     for path, handler in routes(work).items():
         app.add_api_route(path, handler, include_in_schema=False)
     for page in PAGES:
@@ -104,6 +118,8 @@ def serve(folder: Path, address: Address, browser: bool = True) -> None:
         while not Server.instance.started:
             await asyncio.sleep(0.01)
         say(f"{work.project.folder}: {address.link}")
+        for host in address.allowed:
+            say(f"through a tunnel or proxy: http(s)://{host}{address.root}/{address.query}")
         say("Ctrl-C ends the server; runs continue.")
         if first:
             webbrowser.open(first)

@@ -189,7 +189,7 @@ class CheckPage:
             button = ui.button("Correct the mistakes", icon="auto_fix_high", on_click=correct)
             button.props("unelevated no-caps")
         elif result.views and not result.findings:
-            link = "<a href='/reconstruct'>Go on to Reconstruct</a>"
+            link = "<a href='reconstruct'>Go on to Reconstruct</a>"
             ui.html(f"<p>{link}</p>", sanitize=False)
 
 

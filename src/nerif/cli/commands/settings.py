@@ -46,9 +46,9 @@ T = TypeVar("T")
 Flat = tyro.conf.arg(name="")
 """Marks a field whose own fields are options without a prefix."""
 IGNORED_TABLES = ("about",)  # results in run.toml
-COMMAND_LINE_ONLY = ("cluster", "dashboard", "force", "host")
-"""Options that run code of another machine or a shell (cluster), open a port to others, or overwrite files: a file,
-which may come from another person, cannot set them."""
+COMMAND_LINE_ONLY = ("allowed_host", "cluster", "dashboard", "force", "host", "root_path")
+"""Options that run code of another machine or a shell (cluster), open the app or a port to others, or overwrite files:
+a file, which may come from another person, cannot set them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,9 +112,10 @@ def _config(arguments: list[str]) -> Path | None:
 
 def _settings_file(path: Path) -> dict[str, Any]:
     entries = {k: v for k, v in read_toml(path, "settings file (--config)").items() if k not in IGNORED_TABLES}
-    for name in COMMAND_LINE_ONLY:
-        if name in entries:
-            raise InputError(f"expected no '{name}' in a file; give --{name} on the command line", field=path)
+    for name in entries:
+        if (option := name.replace("-", "_")) in COMMAND_LINE_ONLY:
+            option = option.replace("_", "-")
+            raise InputError(f"expected no '{name}' in a file; give --{option} on the command line", field=path)
     return entries
 
 

@@ -243,7 +243,9 @@ def _check_setting(path: Path, name: str, value: Any) -> None:
     """Refuse a value of another type than that of the setting."""
     example = EXAMPLES.get(name, "text")
     kinds = (type(example),) if name in EXAMPLES else (str, int, float)
-    valid = isinstance(value, kinds) and not (isinstance(example, int) and (value is True or value < 1))
+    valid = isinstance(value, kinds)
+    if isinstance(example, int):
+        valid &= isinstance(value, int) and not isinstance(value, bool) and value >= 1
     if isinstance(example, list):
         valid &= all(isinstance(entry, str) for entry in value)
     if not valid and value is not None:
