@@ -9,7 +9,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+import scipy.io
 import tifffile
+import xarray as xr
 
 from commands import run
 from nerif.common.conventions import InputError
@@ -121,6 +123,40 @@ def test_a_command_to_copy_contains_no_command_of_a_name(folder, tmp_path, monke
     ResultDirectory(folder).begin({})
     (folder / CHECKPOINT).touch()
     assert "nerif reconstruct --resume -o './-o `x`'." in ResultDirectory("-o `x`").read().missing[0].sentence
+
+
+VECTORS = {
+    "PIVlab_0001.txt": "PIVlab by W.Th. & E.J.S., ASCII chart output\nFRAME: 1\nx [px],y [px],u [px/frame]\n",
+    "B00001.dat": 'TITLE = "B00001"\nVARIABLES = "x", "y", "Vx", "Vy", "isValid"\nZONE T="Frame 0", I=9, J=9\n',
+    "B00001.txt": '#DaVis 8.4.0 2D-vector 16 9 9 "position" "mm" "position" "mm" "velocity" "m/s"\n1\t2\t3\t4\n',
+    "run.vec": 'TITLE="run" VARIABLES="X mm", "Y mm", "U m/s", "V m/s", "CHC", ZONE I=9, J=9, F=POINT\n',
+    "Export.csv": ">>*HEADER*<<\nFileID:DSExport.CSV\nVersion:2\n",
+    "open.txt": "# x\ty\tu\tv\tflags\tmask\n1 2 3 4 0 0\n",
+    "columns.txt": "16.0\t16.0\t0.12\t-0.3\t0\n", "table.csv": "X (mm);Y (mm);Vx (m/s);Vy (m/s)\n1;2;3;4\n",
+    "B00001.vc7": "\x00\x01", "PIVlab.mat": "u_original typevector_original", "piv.mat": "x y u v",
+    "v.nc": "piv_data piv_flags", "xarray.nc": "u v chc",
+}  # fmt: skip
+NAMES = ["PIVlab", "DaVis", "DaVis", "Insight", "Dynamic Studio", "OpenPIV", "", ""]
+NAMES += ["DaVis", "PIVlab", "", "PIVview", ""]
+
+
+@pytest.mark.parametrize(("name", "program"), [*zip(VECTORS, NAMES, strict=True)])
+def test_vectors_of_other_programs_are_named_and_where_to_go(folder, tmp_path, monkeypatch, refusal, name, program):
+    monkeypatch.chdir(tmp_path)
+    content = VECTORS[name]
+    maps = dict.fromkeys(content.split(), np.zeros((2, 3)))
+    if name.endswith(".mat"):
+        scipy.io.savemat(name, maps)
+    elif name.endswith(".nc"):
+        xr.Dataset({key: (("row", "column"), value) for key, value in maps.items()}).to_netcdf(name, engine="h5netcdf")
+    else:
+        Path(name).write_text(content)
+    got = f"got vectors of {program or 'another program'}; compute displacements from its images: nerif displacement "
+    for command in ("info {}", "reconstruct {} -o new", "displacement {} --calibration c.toml -o n.nc", "calibrate {}"):
+        assert got in refusal(*command.format(name).split())
+    for other in ("name,fx,fy\na,1,1\n", "rx,ry,rz,tx,ty,tz\n1,2,3,4,5,6\n", "cores: 4\n", "a few words, x and y\n"):
+        Path("other.txt").write_text(other)
+        assert kind_of("other.txt") is None
 
 
 @pytest.mark.parametrize("command", COMMANDS)

@@ -6,13 +6,15 @@ Readers open them within `reading_as`: the error for a file of another kind name
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from nerif.common.conventions import InputError
 from nerif.common.files import ending, read_json
+from nerif.common.hdf5 import open_hdf5
 from nerif.common.image_names import ARRAYS as NUMPY_AND_HDF5
 from nerif.common.image_names import FOLDER_SUFFIXES, SOURCES, SUFFIXES
 from nerif.common.installation import quoted, word_of
@@ -84,6 +86,20 @@ ARRAYS = Kind(
     "plain arrays", f"of images: {DISPLACEMENT.format('FOLDER')}; of displacements: nerif.Measurement in Python"
 )
 CALIBRATION = Kind("a calibration", "nerif displacement FOLDER --calibration {path} -o m.nc uses it")
+VECTORS = Kind(
+    "vectors of another program",
+    f"compute displacements from its images: {DISPLACEMENT.format('FOLDER')}; or give u and v in px to "
+    "nerif.Measurement in Python",
+)
+PROGRAMS = {
+    "PIVlab": rb"^PIVlab ", "DaVis": rb"^#\w+ [\d.]+ [23]D-vector|^TITLE *= *\"B\d{5}|\"isValid\"",
+    "Insight": rb"\"CHC\"|TSI", "Dynamic Studio": rb"^>>\*HEADER\*<<", "OpenPIV": rb"^# *x\s+y\s+u\s+v",
+}  # fmt: skip
+"""Marks of programs in the first lines of vectors that they write as text."""
+DAVIS = (".vc7", ".v7")
+PIVLAB = {"u_original", "u_filtered", "typevector_original", "resultslist"}
+PIVVIEW = {"piv_data", "piv_flags"}
+"""Endings of DaVis, variables of the files of PIVlab (.mat) and PIVview (.nc)."""
 SETTINGS = Kind("the settings of a run", "repeat it: nerif reconstruct --config {path} -o RESULT")
 
 
@@ -129,7 +145,10 @@ def _of_folder(path: Path) -> Kind | None:
         return EXPERIMENT
     if _is_view(path):
         return VIEW
-    return IMAGES if any(name.endswith(FOLDER_SUFFIXES) for name in names) else None
+    if any(name.endswith(FOLDER_SUFFIXES) for name in names):
+        return IMAGES
+    files = sorted(entry for entry in path.iterdir() if entry.is_file())
+    return _vectors(files[0]) if files else None
 
 
 def _is_view(folder: Path) -> bool:
@@ -160,7 +179,7 @@ def _of_file(path: Path) -> Kind | None:
         with path.open("rb") as file:
             mark = CALIBRATION_MARK in file.read(MAX_HEAD)
         return CALIBRATION if mark else {"views.toml": VIEWS, RUN: SETTINGS}.get(path.name.lower())
-    if suffix in SUFFIXES and suffix not in ARRAY_SUFFIXES:
+    if suffix in SUFFIXES and suffix not in (*ARRAY_SUFFIXES, *DAVIS):
         return IMAGES
     try:
         with opened(path, "a measurement or a volume") as dataset:
@@ -169,6 +188,58 @@ def _of_file(path: Path) -> Kind | None:
                 return MEASUREMENT
             if {"x", "y", "z"} <= set(dataset.coords):
                 return VOLUME
+            if PIVVIEW & set(dataset.variables):
+                return replace(VECTORS, name="vectors of PIVview")
+            if {"u", "v"} <= set(dataset.variables):
+                return VECTORS
     except InputError:
         pass
+    if (vectors := _vectors(path)) is not None:
+        return vectors
     return ARRAYS if suffix in ARRAY_SUFFIXES else None
+
+
+def _vectors(path: Path) -> Kind | None:
+    """Return the kind of a file of vectors, with the program that wrote it if known; None for any other file."""
+    program, suffix = "", ending(path)
+    if suffix in DAVIS:
+        program = "DaVis"
+    elif suffix == ".mat":
+        names = _matlab_names(path)
+        if not (PIVLAB & names or {"x", "y", "u", "v"} <= names):
+            return None
+        program = "PIVlab" if PIVLAB & names else ""
+    elif suffix in (".txt", ".dat", ".csv", ".vec"):
+        with path.open("rb") as file:
+            head = file.read(MAX_HEAD)
+        program = next((name for name, mark in PROGRAMS.items() if re.search(mark, head, re.MULTILINE)), "")
+        if not (program or _are_vectors(head.decode("latin-1").splitlines()[:10])):
+            return None
+    else:
+        return None
+    return replace(VECTORS, name=f"vectors of {program}") if program else VECTORS
+
+
+def _are_vectors(lines: list[str]) -> bool:
+    """Return whether lines name the columns x, y, u, v, or begin with four to seven numbers, as older OpenPIV."""
+    rows = [re.sub(r"\[.*?\]|\(.*?\)|[\",;]", " ", line).lower().split() for line in lines]
+    if any({"x", "y"} <= {*row} and ({"u", "v"} <= {*row} or {"vx", "vy"} <= {*row}) for row in rows):
+        return True
+    try:
+        return 4 <= len([float(word) for row in rows[:1] for word in row]) <= 7
+    except ValueError:
+        return False
+
+
+def _matlab_names(path: Path) -> set[str]:
+    """Names of the variables of a MATLAB file; none of one that cannot be read."""
+    import h5py
+    import scipy.io
+
+    try:
+        if h5py.is_hdf5(path):
+            with open_hdf5(path) as file:
+                return set(file)
+        return {name for name, *_ in scipy.io.whosmat(str(path))}
+    except Exception:  # of SciPy and h5py, of many kinds
+        return set()
