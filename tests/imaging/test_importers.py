@@ -334,6 +334,43 @@ def test_telecentric_cameras_of_tables(tmp_path):
         refuse(path, "projection: expected one of perspective, telecentric")
 
 
+def test_anipose(tmp_path):
+    """Rotation vectors, width before height, and the names of the cameras beside those of the tables."""
+    path = tmp_path / "calibration.toml"
+    tables: dict[str, Any] = {
+        f"cam_{i}": {
+            "name": c.name, "size": [200, 160], "translation": c.translation.tolist(),
+            "matrix": c.intrinsics.tolist(), "distortions": c.distortion.tolist(),
+            "rotation": cv2.Rodrigues(c.rotation.numpy())[0].ravel().tolist(),
+        }
+        for i, c in enumerate((ONE, TWO))
+    }  # fmt: skip
+    path.write_text(tomli_w.dumps({**tables, "metadata": {"adjusted": False, "error": 0.3}}))
+    got = import_cameras(path)
+    assert [(c.name, c.image_size) for c in got] == [("one", (160, 200)), ("two", (160, 200))]
+    assert same(got, ONE, TWO)
+    tables["cam_1"]["fisheye"] = True
+    path.write_text(tomli_w.dumps(tables))
+    refuse(path, "camera 'cam_1': .* got 'fisheye'")
+    del tables["cam_1"]["rotation"]
+    path.write_text(tomli_w.dumps(tables))
+    refuse(path, "camera 'cam_1': expected distortions, matrix, .* as anipose writes them")
+
+
+@pytest.mark.parametrize(
+    ("name", "program", "text"),
+    [
+        ("calibrated_cameras_data.yml", "MC-Calib", "%YAML:1.0\n---\nnb_camera: 2\ncamera_0:\n   img_width: 200\n"),
+        ("18284509.xml", "OpenPose", '<?xml version="1.0"?>\n<opencv_storage>\n<CameraMatrix>1 0</CameraMatrix>\n'
+         "<Intrinsics>3</Intrinsics>\n</opencv_storage>\n"),
+        ("calibration.json", "multical", '{"cameras": {"cam1": {"K": []}}, "camera_poses": {"cam1": {"R": []}}}'),
+    ],
+)  # fmt: skip
+def test_calibrations_of_programs_that_are_not_read_are_named(tmp_path, name, program, text):
+    (tmp_path / name).write_text(text)
+    refuse(tmp_path / name, f"a calibration of {program}, which nerif does not read; write .* K, R .* into a .toml")
+
+
 # -- OpenCV --------------------------------------------------------------------------------------------------------
 
 BOTH = {f"{k}{i}": v for i, camera in ((1, ONE), (2, TWO)) for k, v in arrays(camera).items()}
@@ -714,10 +751,11 @@ def test_images_of_one_camera_are_one_camera(nerf):
 
 
 @pytest.mark.parametrize("imported", [False, True])
-def test_cameras_without_names_are_assigned_by_order_to_as_many_views(tmp_path, nerf, capsys, imported):
+def test_cameras_without_names_are_assigned_by_order_to_as_many_views(tmp_path, nerf, capsys, monkeypatch, imported):
     """Of 0003.png, 0001.png, 0002.png the first by number is that of the first view; cam10 stands behind cam9."""
     folder, cameras = tmp_path / "experiment", [make("", seed) for seed in range(3)]
     path = nerf(*({**transforms(c), "file_path": f"{n}.png"} for c, n in zip(cameras, (30, 9, 10), strict=True)))
+    monkeypatch.setattr(calibrate, "_draw", lambda *rig: None)
     if imported:
         calibrate.main([str(path), "--image-size", "160", "200", "-o", str(path := tmp_path / "c.toml")])
         assert "3 cameras imported from" in capsys.readouterr().out
@@ -977,6 +1015,161 @@ def test_matlab_errors(mat):
         refuse(path, words)
     path.write_bytes(b"not a MATLAB file at all")
     refuse(path, "not a readable MATLAB file")
+
+
+# -- COLMAP and OpenPTV --------------------------------------------------------------------------------------------
+
+COLMAP = {
+    "SIMPLE_PINHOLE": "900.0 101.3 79.1", "PINHOLE": "900.0 880.0 101.3 79.1",
+    "SIMPLE_RADIAL": "900.0 101.3 79.1 -0.12", "RADIAL": "900.0 101.3 79.1 -0.12 0.05",
+    "OPENCV": "900.0 880.0 101.3 79.1 -0.12 0.05 0.002 -0.001",
+    "FULL_OPENCV": "900.0 880.0 101.3 79.1 -0.12 0.05 0.002 -0.001 0.3 0 0 0",
+}  # fmt: skip
+
+
+def colmap_pixels(model: str, words: str, quaternion: np.ndarray, shift: np.ndarray) -> np.ndarray:
+    """As COLMAP documents: x_cam = R x + t, distorted, times f, plus the principal point, from the first corner."""
+    x, y, z = (Rotation.from_quat(np.roll(quaternion, -1)).as_matrix() @ POINTS.numpy().T) + shift[:, None]
+    u, v = x / z, y / z
+    p, r2 = [float(word) for word in words.split()], (x**2 + y**2) / z**2
+    if model.startswith(("SIMPLE", "RADIAL")):
+        p.insert(0, p[0])
+    fx, fy, cx, cy, k1, k2, p1, p2, k3 = [*p, *[0.0] * 5][:9]
+    radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+    du, dv = 2 * p1 * u * v + p2 * (r2 + 2 * u**2), 2 * p2 * u * v + p1 * (r2 + 2 * v**2)
+    return np.stack([fx * (u * radial + du) + cx, fy * (v * radial + dv) + cy], axis=1)
+
+
+def write_colmap(folder: Path, models: dict[str, str], points: str = "12.5 13.5 -1 90 80 17") -> list[np.ndarray]:
+    """A model with one image by each camera, and the pixels of POINTS in them."""
+    rng, images, pixels = np.random.default_rng(5), ["# Image list with two lines of data per image:"], []
+    cameras = ["# Camera list with one line of data per camera:"]
+    for i, (model, words) in enumerate(models.items(), 1):
+        quaternion, shift = Rotation.random(random_state=rng).as_quat(), np.array([3.0, -4.0, 400.0 + i])
+        cameras.append(f"{7 * i} {model} 200 160 {words}")
+        pose = " ".join(map(str, [*2.0 * quaternion, *shift]))  # scaled quaternions are rotations too
+        images += [f"{i} {pose} {7 * i} cam{i}/first image.png", points]
+        pixels.append(colmap_pixels(model, words, quaternion, shift))
+    (folder / "cameras.txt").write_text("\n".join(cameras))
+    (folder / "images.txt").write_text("\n".join(images))
+    return pixels
+
+
+@pytest.mark.parametrize("points", ["", "12.5 13.5 -1 90 80 17"])
+def test_a_model_of_colmap(tmp_path, points):
+    expected, lines = write_colmap(tmp_path, COLMAP, points), []
+    assert is_calibration(tmp_path)
+    for path in (tmp_path, tmp_path / "cameras.txt", tmp_path / "images.txt"):
+        cameras = import_cameras(path, say=lines.append)
+        assert [c.name for c in cameras] == [f"cam{i}" for i in range(1, 7)]
+        for camera, pixels in zip(cameras, expected, strict=True):
+            assert camera.image_size == (160, 200)
+            np.testing.assert_allclose(camera.camera(background=PLANE).project(POINTS), pixels - 0.5, atol=1e-9)
+    assert "--scale-mm" in lines[0]
+    assert torch.allclose(
+        import_cameras(tmp_path, ImportSettings(scale_mm=20.0))[0].translation, 20 * cameras[0].translation
+    )
+
+
+@pytest.mark.parametrize(
+    ("models", "change", "words"),
+    [
+        ({"FOV": "900 880 100 80 0.9"}, ("", ""), "camera 7: expected one of SIMPLE_PINHOLE, .* got FOV; undistort"),
+        ({"FULL_OPENCV": "9 8 1 8 0 0 0 0 0 0.1 0 0"}, ("", ""), "at most 5 distortion coefficients"),
+        ({"OPENCV": "900 880 100 80"}, ("", ""), "expected WIDTH HEIGHT fx fy cx cy k1 k2 p1 p2, got 200 160 900"),
+        ({"PINHOLE": "900 880 100 80"}, (" 7 cam1", " 8 cam1"), "images.txt: expected IMAGE_ID QW .* got 1 "),
+        ({"PINHOLE": "900 880 100 80"}, ("1 ", "1 far "), "images.txt: expected IMAGE_ID QW .* got 1 far"),
+        ({}, ("", ""), "holds no camera"),
+    ],
+)
+def test_models_of_colmap_that_are_refused(tmp_path, models, change, words):
+    write_colmap(tmp_path, models)
+    path = tmp_path / "images.txt"
+    path.write_text(path.read_text().replace(*change, 1) if change[0] else path.read_text())
+    refuse(tmp_path, words)
+    path.rename(tmp_path / "images.bin")
+    refuse(tmp_path, "colmap model_converter")
+
+
+PTV = "3\n{}1\n0\n1\n200\n160\n0.017\n0.016\n0\n1.0\n1.0\n1.0\n0.0\n"
+
+
+def openptv_pixels(ori: list[float], added: list[float]) -> np.ndarray:
+    """As liboptv documents: collinearity with y up, Brown's distortion about the middle of the sensor, mm to pixels."""
+    position, (omega, phi, kappa), (xh, yh, cc) = np.array(ori[:3]), ori[3:6], ori[15:18]
+    k1, k2, k3, p1, p2, scx, she = added
+    dm = (Rotation.from_rotvec([omega, 0, 0]) * Rotation.from_rotvec([0, phi, 0]) * Rotation.from_rotvec([0, 0, kappa]))
+    a, b, c = dm.as_matrix().T @ (POINTS.numpy() - position).T
+    x, y = xh - cc * a / c, yh - cc * b / c
+    r2 = x**2 + y**2
+    radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+    x, y = (x * radial + p1 * (r2 + 2 * x**2) + 2 * p2 * x * y, y * radial + p2 * (r2 + 2 * y**2) + 2 * p1 * x * y)
+    x, y = scx * x - np.sin(she) * y, np.cos(she) * y
+    return np.stack([x / 0.017 + 200 / 2, 160 / 2 - y / 0.016], axis=1)  # a pixel is centred on 0.5
+
+
+def write_openptv(folder: Path, ori: list[float], added: list[float] | None, name: str) -> Path:
+    path = folder / "cal" / f"{name}.ori"
+    dm = Rotation.from_euler("XYZ", ori[3:6]).as_matrix()
+    rows = [ori[:3], ori[3:6], *dm.tolist(), ori[15:17], ori[17:18], [0.0001, 0.00001, 150.0]]
+    for inner in ("cal", "parameters"):
+        (folder / inner).mkdir(exist_ok=True)
+    path.write_text("\n".join(" ".join(map(str, row)) for row in rows))
+    if added is not None:
+        path.with_suffix(".addpar").write_text(" ".join(map(str, added)))
+    (folder / "parameters" / "ptv.par").write_text(PTV.format("img/cam1\ncal/cam1.tif\n" * 3))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("shift", "added", "error"),
+    [
+        ((0.0, 0.0), None, 1e-9),
+        ((0.0, 0.0), [4e-4, -2e-5, 1e-6, 3e-4, -2e-4, 1.002, 0.003], 1e-6),
+        ((0.12, -0.07), [4e-4, 0, 0, 0, 0, 1.0, 0.0], 0.005),
+        ((0.12, -0.07), [0, 0, 0, 0, 0, 0.99, -0.01], 1e-6),
+    ],
+)
+def test_cameras_of_openptv(tmp_path, shift, added, error):
+    """With a principal point beside the middle of the sensor the distortion is that of OpenCV to a few thousandths."""
+    expected = {}
+    for name, pose in (("cam1", [30.0, 20, 420, -0.05, 0.07, 0.3]), ("cam2", [-420.0, 9, 3, 0.1, -1.57, 2])):
+        ori = [*pose, *[0.0] * 9, *shift, 20.0]
+        path = write_openptv(tmp_path, ori, added, f"{name}.tif")
+        expected[name] = openptv_pixels(ori, added or [0, 0, 0, 0, 0, 1, 0]) - 0.5
+    assert is_calibration(tmp_path / "cal")
+    cameras = import_cameras(tmp_path / "cal")
+    assert [c.name for c in cameras] == ["cam1", "cam2"]
+    for camera in (*cameras, *import_cameras(path)):
+        assert camera.image_size == (160, 200)
+        pixels = expected[camera.name]
+        inside = ((pixels > 0) & (pixels < (199, 159))).all(axis=1)
+        assert inside.sum() >= 5
+        got = camera.camera(background=PLANE).project(POINTS).numpy()
+        assert np.abs(got - pixels)[inside].max() < error
+
+
+def test_openptv_that_is_refused(tmp_path):
+    ori = [0.0, 0.0, 400.0, *[0.0] * 12, 0.0, 0.0, 20.0]
+    path, sensor = write_openptv(tmp_path, ori, None, "cam1"), tmp_path / "parameters" / "ptv.par"
+    text = sensor.read_text()
+    for change, words in (
+        (("1.0\n0.0\n", "1.33\n5.0\n"), "one medium, got interlaced = 0, n = 1.0, 1.0, 1.33; .* without water"),
+        (("\n0\n1.0", "\n1\n1.0"), "whole frames and one medium, got interlaced = 1"),
+        (("200", "wide"), "a number a line"),
+    ):
+        sensor.write_text(text.replace(*change))
+        with pytest.raises(InputError, match=words):
+            import_cameras(path)
+    sensor.write_text(text)
+    path.with_suffix(".addpar").write_text("0.02 0 0 0 0 1 0")
+    write_openptv(tmp_path, [*ori[:15], 1.1, -0.6, 20.0], [0.03, 0, 0, 0, 0, 1, 0], "cam1")
+    refuse(path, r"a distortion that OpenCV's covers within 0.05 px, got .* undistort the images")
+    path.write_text("0 0 400\n0 0 0\n")
+    refuse(path, "expected 18 numbers of OpenPTV, got 6 words")
+    sensor.unlink()
+    with pytest.raises(InputError, match=r"parameters/ptv.par beside the folder of the cameras, got none"):
+        import_cameras(path)
 
 
 # -- any -----------------------------------------------------------------------------------------------------------

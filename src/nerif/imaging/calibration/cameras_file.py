@@ -40,8 +40,8 @@ from nerif.geometry import PERSPECTIVE, Box, Camera, Lens, Plane, Projection, pr
 from nerif.geometry.distortion import UPRIGHT
 
 __all__ = [
-    "FORMAT", "CalibratedCamera", "check_camera", "check_distortion", "check_model", "check_names", "flat",
-    "numbers", "read_box", "read_cameras", "write_cameras",
+    "FORMAT", "CalibratedCamera", "check_camera", "check_distortion", "check_model", "check_names",
+    "check_program", "flat", "numbers", "read_box", "read_cameras", "write_cameras",
 ]  # fmt: skip
 
 FORMAT = "nerif-calibration-1"
@@ -52,6 +52,9 @@ BROWN = (
     "brown", "opencv", "perspective", "pinhole", "plumb_bob", "radial", "radtan", "simple_pinhole", "simple_radial",
 )  # fmt: skip
 """Names that programs give to camera models with Brown's distortion (k1, k2, p1, p2, k3)."""
+UNREAD = {
+    "MC-Calib": {"nb_camera"}, "OpenPose": {"CameraMatrix", "Intrinsics"}, "multical": {"cameras", "camera_poses"},
+}  # fmt: skip
 LIKE_DISTORTION = re.compile("(?<!un)dist(?!an)|^tau_?[xy]|tilt", re.IGNORECASE)  # not undistorted images, distances
 
 
@@ -211,6 +214,17 @@ def check_model(model: Any, where: str) -> None:
             "calibrate again with one of those models, or undistort the images first",
             field=where,
         )
+
+
+def check_program(keys: Iterable[str], where: str) -> None:
+    """Refuse the files of programs that nerif does not read, recognised by their keys."""
+    for program, marks in UNREAD.items():
+        if marks <= {*keys}:
+            raise InputError(
+                f"a calibration of {program}, which nerif does not read; write its cameras as tables [cam1] with K, R "
+                "(3 x 3) and t, x_cam = R x_world + t in mm, and distortion k1 k2 p1 p2 k3 into a .toml",
+                field=where,
+            )
 
 
 def check_distortion(keys: Iterable[str], read: Collection[str], names: Sequence[str], where: str) -> None:

@@ -22,9 +22,11 @@ from nerif.data.kinds import ARRAYS, CALIBRATION, IMAGES, reading_as
 from nerif.geometry import Box, Lens, Plane
 from nerif.geometry.distortion import POWERS
 from nerif.imaging.calibration.cameras_file import CalibratedCamera, check_camera, check_names, read_box
+from nerif.imaging.calibration.importers.colmap import COLMAP, read_colmap
 from nerif.imaging.calibration.importers.geometry_files import read_geometry
 from nerif.imaging.calibration.importers.matlab import read_matlab
 from nerif.imaging.calibration.importers.nerfstudio import read_transforms
+from nerif.imaging.calibration.importers.openptv import ORI, read_openptv
 from nerif.imaging.calibration.importers.tables import read_csv, read_tables
 from nerif.imaging.calibration.importers.yaml_files import ENDINGS as YAML
 from nerif.imaging.calibration.importers.yaml_files import read_yaml_files
@@ -33,7 +35,7 @@ from nerif.imaging.readers.views import VIEWS
 __all__ = ["ImportSettings", "import_box", "import_cameras", "is_calibration"]
 
 READERS = {".toml": read_tables, ".csv": read_csv, ".json": read_transforms}
-ENDINGS = (*READERS, *YAML, ".mat", ".npz")
+ENDINGS = (*READERS, *YAML, ".mat", ".npz", ORI)
 
 
 @dataclass(frozen=True)
@@ -84,12 +86,12 @@ class ImportSettings:
 
 
 def is_calibration(path: Path) -> bool:
-    """Distinguish a calibration, a file or a folder of YAML files, from a folder with images of an experiment."""
+    """Distinguish a calibration, a file or a folder of such files, from a folder with images of an experiment."""
     if not path.is_dir():
         return True
     entries = list(path.iterdir())
     images = any(entry.is_dir() or entry.name.lower() == VIEWS for entry in entries)
-    return not images and any(ending(entry) in YAML for entry in entries)
+    return not images and any(ending(entry) in (*YAML, ORI) or entry.name in COLMAP for entry in entries)
 
 
 def import_cameras(
@@ -98,11 +100,12 @@ def import_cameras(
     only: Sequence[str] = (),
     say: Callable[[str], None] = lambda line: None,
 ) -> tuple[CalibratedCamera, ...]:
-    """Read the cameras of a file, or of a folder with one YAML file per camera; errors name the file.
+    """Read the cameras of a file, or of a folder with one file per camera or with COLMAP's; errors name the file.
 
     Parameters
     ----------
-    path : .toml, .csv, .yml, .yaml, .xml (OpenCV, ROS, kalibr), .json (NeRF), .mat (MATLAB), .npz (ASTRA, TIGRE)
+    path : .toml, .csv, .yml, .yaml, .xml (OpenCV, ROS, kalibr), .json (NeRF), .mat (MATLAB), .npz (ASTRA, TIGRE),
+        .ori (OpenPTV), cameras.txt (COLMAP)
     only : names of the cameras to read; all if empty
     say : called with lines about what was read
     """
@@ -124,6 +127,13 @@ def _read(path: Path, settings: ImportSettings, say: Callable[[str], None]) -> t
     """Return the cameras of a file, and the unit of length by its format, mm."""
     if not path.is_dir():
         check_file(path, f"file; expected a calibration ({' '.join(ENDINGS)})")
+    entries = {entry.name for entry in path.iterdir()} if path.is_dir() else {path.name}
+    if entries & {*COLMAP}:
+        if settings.scale_mm is None:
+            say("note: COLMAP's unit of length is arbitrary; give the true one with --scale-mm")
+        return read_colmap(path), 1.0
+    if any(name.lower().endswith(ORI) for name in entries):
+        return read_openptv(path, say), 1.0
     if path.is_dir() or ending(path) in YAML:
         return read_yaml_files(path, say)
     if ending(path) == ".mat":
@@ -132,7 +142,9 @@ def _read(path: Path, settings: ImportSettings, say: Callable[[str], None]) -> t
         return read_geometry(path, say), 1.0
     if ending(path) in READERS:
         return READERS[ending(path)](path), 1.0
-    raise InputError(f"expected a calibration ending in {' '.join(ENDINGS)}, got '{path.suffix}'", field=path)
+    raise InputError(
+        f"expected a calibration ending in {' '.join(ENDINGS)}, or COLMAP's cameras.txt, got '{path.name}'", field=path
+    )
 
 
 def import_box(path: Path, settings: ImportSettings = ImportSettings()) -> Box | None:

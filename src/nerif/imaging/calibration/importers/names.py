@@ -44,7 +44,7 @@ def named_by_images(cameras: Sequence[CalibratedCamera], images: Sequence[str]) 
 
 def _labels(paths: list[PurePosixPath]) -> Iterator[list[str]]:
     """Yield possible names of the cameras, the best first."""
-    for i in range(max(len(path.parent.parts) for path in paths)):
+    for i in range(max((len(path.parent.parts) for path in paths), default=0)):
         folders = [path.parents[i].name if i < len(path.parents) else "" for path in paths]
         if len(set(folders)) > 1:
             yield folders

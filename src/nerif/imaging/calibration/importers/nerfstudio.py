@@ -10,7 +10,13 @@ import torch
 
 from nerif.common.conventions import InputError
 from nerif.common.files import read_json
-from nerif.imaging.calibration.cameras_file import CalibratedCamera, check_distortion, check_model, numbers
+from nerif.imaging.calibration.cameras_file import (
+    CalibratedCamera,
+    check_distortion,
+    check_model,
+    check_program,
+    numbers,
+)
 from nerif.imaging.calibration.importers.names import named_by_images
 
 __all__ = ["read_transforms"]
@@ -28,6 +34,7 @@ def read_transforms(path: Path) -> list[CalibratedCamera]:
     the images name the cameras.
     """
     content = read_json(path)
+    check_program(content if isinstance(content, dict) else (), str(path))
     frames = content.get("frames") if isinstance(content, dict) else None
     if not isinstance(frames, list) or not frames or not all(isinstance(f, dict) for f in frames):
         raise InputError("expected NeRF's transforms.json with a list 'frames', got none", field=path)

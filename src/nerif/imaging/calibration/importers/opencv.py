@@ -11,7 +11,13 @@ from typing import Any
 import numpy as np
 
 from nerif.common.conventions import InputError
-from nerif.imaging.calibration.cameras_file import CalibratedCamera, check_distortion, check_model, flat
+from nerif.imaging.calibration.cameras_file import (
+    CalibratedCamera,
+    check_distortion,
+    check_model,
+    check_program,
+    flat,
+)
 
 __all__ = ["read_opencv", "read_storage"]
 
@@ -168,6 +174,7 @@ def read_storage(path: Path) -> dict[str, Any]:
         keys = []
     if not keys:
         raise InputError("not a file of OpenCV's FileStorage, ROS or kalibr, or empty", field=path)
+    check_program(keys, str(path))
     values: dict[str, Any] = {}
     for key in keys:
         node = storage.getNode(key)

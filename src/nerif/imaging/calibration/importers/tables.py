@@ -8,11 +8,12 @@ import math
 import re
 from collections import Counter
 from pathlib import Path
+from typing import Any
 
 from nerif.common.conventions import InputError
 from nerif.common.files import check_known, read_toml
 from nerif.geometry import PERSPECTIVE
-from nerif.imaging.calibration.cameras_file import FORMAT, CalibratedCamera, read_cameras
+from nerif.imaging.calibration.cameras_file import FORMAT, CalibratedCamera, check_model, numbers, read_cameras
 from nerif.imaging.calibration.importers.names import UNNAMED
 
 __all__ = ["read_csv", "read_tables"]
@@ -20,6 +21,7 @@ __all__ = ["read_csv", "read_tables"]
 KEYS = ("K", "R", "t", "distortion", "image_size", "normal", "offset", "projection", "tilt")
 REQUIRED = ("fx", "fy", "cx", "cy", *(f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)), "tx", "ty", "tz")
 DISTORTION, TILT = ("k1", "k2", "p1", "p2", "k3"), ("tau_x", "tau_y")
+ANIPOSE = {"name", "matrix", "distortions", "rotation", "translation"}
 TEXTS = ("name", "projection")
 COLUMNS = (*TEXTS, *REQUIRED, "s", *DISTORTION, *TILT, "width", "height", "nx", "ny", "nz", "offset")
 
@@ -29,6 +31,8 @@ def read_tables(path: Path) -> list[CalibratedCamera]:
     tables = read_toml(path)
     if "format" in tables or "camera" in tables:
         return list(read_cameras(path))
+    if any(isinstance(table, dict) and table.keys() >= ANIPOSE for table in tables.values()):
+        return [_anipose(path, key, table) for key, table in tables.items() if key != "metadata"]
     cameras = []
     for name, table in tables.items():
         where = f"{path}: camera '{name}'"
@@ -46,6 +50,23 @@ def read_tables(path: Path) -> list[CalibratedCamera]:
             )
         )  # fmt: skip
     return cameras
+
+
+def _anipose(path: Path, key: str, table: Any) -> CalibratedCamera:
+    """Read a camera of anipose: OpenCV's, with a rotation vector, and width before height."""
+    import cv2
+
+    where = f"{path}: camera '{key}'"
+    if not isinstance(table, dict) or not table.keys() >= ANIPOSE:
+        raise InputError(f"expected {', '.join(sorted(ANIPOSE))} as anipose writes them, got {table!r}", field=where)
+    if table.get("fisheye"):
+        check_model("fisheye", where)
+    rotation = cv2.Rodrigues(numbers(table["rotation"], (3,), f"{where}: rotation").numpy())[0]
+    size = table.get("size")
+    return CalibratedCamera.from_values(
+        where, str(table["name"]), table["matrix"], rotation, table["translation"], table["distortions"],
+        size[::-1] if isinstance(size, list) else size,
+    )  # fmt: skip
 
 
 def read_csv(path: Path) -> list[CalibratedCamera]:
