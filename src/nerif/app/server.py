@@ -108,7 +108,8 @@ def serve(folder: Path, address: Address, browser: bool = True) -> None:
         Guard, token=address.token, hosts=address.names, port=address.port, allowed=address.allowed,
         root=address.root, say=say,
     )  # fmt: skip
-    app.add_api_route("/", lambda: RedirectResponse(_first(work.project).path[1:]), include_in_schema=False)
+    first_path = _first(work.project).path[1 if address.root else 0 :]  # a proxy changes absolute ones
+    app.add_api_route("/", lambda: RedirectResponse(first_path), include_in_schema=False)
     for path, handler in routes(work).items():
         app.add_api_route(path, handler, include_in_schema=False)
     for page in PAGES:

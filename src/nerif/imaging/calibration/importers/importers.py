@@ -133,7 +133,7 @@ def _read(path: Path, settings: ImportSettings, say: Callable[[str], None]) -> t
             say("note: COLMAP's unit of length is arbitrary; give the true one with --scale-mm")
         return read_colmap(path), 1.0
     if any(name.lower().endswith(ORI) for name in entries):
-        return read_openptv(path, say), 1.0
+        return read_openptv(path), 1.0
     if path.is_dir() or ending(path) in YAML:
         return read_yaml_files(path, say)
     if ending(path) == ".mat":

@@ -9,15 +9,14 @@ The camera looks along -z, with y up. From the middle of the sensor, D^T (X - x0
     (x, y) = (xh, yh) + cc (a, b) / c,     x += x (k1 r^2 + k2 r^4 + k3 r^6) + p1 (r^2 + 2 x^2) + 2 p2 x y,
     column = (scx x - sin(she) y) / pixel + columns / 2,     row = rows / 2 - cos(she) y / pixel
 
-and y in the same way; pixel centres are at 0.5. The distortion is about the middle of the sensor, OpenCV's about the principal
-point, so that its coefficients are fitted; a difference is refused.
+and y in the same way; pixel centres are at 0.5. The distortion is about the middle of the sensor, OpenCV's about the
+principal point, so that its coefficients are fitted; a difference is refused.
 
 Source: OpenPTV, liboptv: calibration.c, imgcoord.c, trafo.c, parameters.c, segmentation.c.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -30,24 +29,19 @@ from nerif.imaging.calibration.cameras_file import CalibratedCamera
 __all__ = ["ORI", "read_openptv"]
 
 ORI = ".ori"
-MOST, LEAST = 0.05, 1e-4  # px, by which OpenCV's distortion may differ, and from which it is reported
+MOST = 0.05  # px, by which OpenCV's distortion may differ
 PLACES = ("../parameters/ptv.par", "parameters/ptv.par", "ptv.par", "../ptv.par")
 """Of the parameters of the sensor, from the folder of the cameras."""
 
 Points = Float[np.ndarray, "n 2"]
 
 
-def read_openptv(path: Path, say: Callable[[str], None]) -> list[CalibratedCamera]:
-    """Read one camera, or all of a folder, named by their images.
-
-    Parameters
-    ----------
-    say : called with a line about distortion that OpenCV's does not cover exactly
-    """
+def read_openptv(path: Path) -> list[CalibratedCamera]:
+    """Read one camera, or all of a folder, named by their images."""
     folder = path if path.is_dir() else path.parent
     files = sorted(p for p in folder.iterdir() if ending(p) == ORI) if path.is_dir() else [path]
     size, pixel = _sensor(folder)
-    return [_camera(file, size, pixel, say) for file in files]
+    return [_camera(file, size, pixel) for file in files]
 
 
 def _sensor(folder: Path) -> tuple[tuple[int, int], tuple[float, float]]:
@@ -85,17 +79,16 @@ def _numbers(path: Path, count: int) -> list[float]:
     return numbers
 
 
-def _camera(
-    path: Path, size: tuple[int, int], pixel: tuple[float, float], say: Callable[[str], None]
-) -> CalibratedCamera:  # fmt: skip
+def _camera(path: Path, size: tuple[int, int], pixel: tuple[float, float]) -> CalibratedCamera:
     import cv2
     from scipy.optimize import least_squares
+    from scipy.spatial.transform import Rotation
 
     ori = np.array(_numbers(path, 18))
     added = path.with_suffix(".addpar")
     k1, k2, k3, p1, p2, scx, she = _numbers(added, 7) if added.is_file() else [0, 0, 0, 0, 0, 1, 0]
     (xh, yh, cc), (rows, columns) = ori[15:18], size
-    turn = np.diag([1.0, -1.0, -1.0]) @ _rotation(*ori[3:6]).T
+    turn = np.diag([1.0, -1.0, -1.0]) @ Rotation.from_euler("XYZ", ori[3:6]).as_matrix().T
     affine = np.array([[scx, np.sin(she)], [0, np.cos(she)]]) / np.array(pixel)[:, None]  # px per mm, y down
     middle = np.array([columns, rows]) / 2 - 0.5
 
@@ -115,10 +108,9 @@ def _camera(
         return distorted @ np.array([[fx, 0], [s, fy]]) + (cx, cy)
 
     reach = np.array([columns * pixel[0], rows * pixel[1]]) / 2
-    at = np.stack(np.meshgrid(*(np.linspace(-1, 1, 15),) * 2), axis=-1).reshape(-1, 2)
-    at = (at * reach - (xh, -yh)) / cc
-    radius = float(np.abs(at).max())
-    scales = radius ** np.array([2, 4, 1, 1, 6])  # so that all parameters are of one order
+    grid = np.stack(np.meshgrid(*(np.linspace(-1, 1, 15),) * 2), axis=-1).reshape(-1, 2)
+    at = (grid * reach - (xh, -yh)) / cc
+    scales = np.abs(at).max() ** np.array([2, 4, 1, 1, 6])  # so that all coefficients are of one order
     (fx, s), (_, fy) = cc * affine
     cx, cy = middle + affine @ (xh, -yh)
     start = [fx, s, fy, cx, cy, *(scales * (k1 * cc**2, k2 * cc**4, -p2 * cc, p1 * cc, k3 * cc**6))]
@@ -133,15 +125,7 @@ def _camera(
             "or calibrate again with xh = yh = 0",
             field=path,
         )
-    if error > LEAST:
-        say(f"{path.name}: OpenCV's distortion differs by up to {error:.2g} px")
     fx, s, fy, cx, cy = fit.x[:5]
     name = Path(path.stem).stem if "." in path.stem else path.stem
     k = [[fx, s, cx], [0, fy, cy], [0, 0, 1]]
     return CalibratedCamera.from_values(str(path), name, k, turn, -turn @ ori[:3], fit.x[5:] / scales, size)
-
-
-def _rotation(omega: float, phi: float, kappa: float) -> Float[np.ndarray, "3 3"]:
-    from scipy.spatial.transform import Rotation
-
-    return np.asarray(Rotation.from_euler("XYZ", [omega, phi, kappa]).as_matrix())
