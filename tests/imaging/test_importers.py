@@ -729,6 +729,7 @@ def test_nerf_angle_of_view(nerf):
         (("cam2/b.png", "cam1/a.png", "cam3/c.png"), "cam2 cam1 cam3"),
         (("b/left_01.tif", "b/top_01.tif", "b/right_01.tif"), "left top right"),
         (("b/cam_1.tif", "b/cam_2.tif", "b/cam_4.tif"), "cam_1 cam_2 cam_4"),
+        (("001/cam7.png", "002/cam5.png", "003/cam6.png"), "cam7 cam5 cam6"),
         (("train/0003.png", "train/0001.png", "val/0002.png"), "0003 0001 0002"),
         (("a/x.png", "b/x.png", "b/x.png"), "unnamed1 unnamed2 unnamed3"),
         ((None, "b/x.png", "b/y.png"), "unnamed1 unnamed2 unnamed3"),

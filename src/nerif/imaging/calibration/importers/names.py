@@ -32,7 +32,8 @@ def named_by_images(cameras: Sequence[CalibratedCamera], images: Sequence[str]) 
     ----------
     images : path of the image of each camera, "" if unknown
     """
-    for labels in _labels([PurePosixPath(image.replace("\\", "/")) for image in images]):
+    candidates = _labels([PurePosixPath(image.replace("\\", "/")) for image in images])
+    for labels in sorted(candidates, key=lambda labels: all(NUMBER.fullmatch(label) for label in labels)):
         by_name: dict[str, CalibratedCamera] = {}
         if all(
             label and all(torch.equal(getattr(by_name.setdefault(label, c), x), getattr(c, x)) for x in SAME)
