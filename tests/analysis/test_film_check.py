@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,8 +25,8 @@ PLUME = Path(__file__).parents[3] / "shared/data/plume/plume.nc"
 class Frames:
     """A film in memory."""
 
-    def __init__(self, frames: list[Measurement]) -> None:
-        self.frames = frames
+    def __init__(self, frames: list[Measurement], times: Sequence[float] = ()) -> None:
+        self.frames, self.times = frames, times or range(len(frames))
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -144,6 +145,7 @@ def test_two_views_show_a_difference_but_not_which_is_late(synchronous):
     (finding,) = found.findings
     assert (finding.code, finding.views) == ("late", ("45deg",))
     assert "2 frames late, or the other views 2 frames early; equal numbers of views do not decide" in str(finding)
+    assert found.remarks[-1].startswith("fewer than three views: from one instant the check cannot tell")
 
 
 def test_the_remedy_adds_to_the_offsets_of_the_measurement():
@@ -172,6 +174,10 @@ def test_frames_without_all_views_are_avoided(synchronous):
     assert len(instants) == 7
     assert not {0, 1, 12} & set(instants)
     assert not Excerpt(Frames(frames[:5])).liveliest()
+    paused = Excerpt(Frames(synchronous, [0.1 * (i + 4 * (i > 9)) for i in range(FRAMES)]))  # without 10 to 13
+    assert paused.length == FRAMES + 4
+    assert [paused.has([i]) for i in (9, 10, 13, 14)] == [True, False, False, True]
+    assert not {10, 11, 12, 13} & set(paused.liveliest())
     alone = check_film(Frames([frame.select(frame.names[:1]) for frame in synchronous]), 8)
     assert any("one view: its film cannot be compared" in remark for remark in alone.remarks)
 

@@ -8,6 +8,7 @@ import pickle
 from collections import Counter
 from dataclasses import replace
 
+import h5py
 import numpy as np
 import pytest
 import tifffile
@@ -23,12 +24,13 @@ from nerif.imaging.calibration.cameras_file import CalibratedCamera
 from nerif.imaging.displacement.displacement import DisplacementSettings
 from nerif.imaging.masks import MaskSettings
 from nerif.imaging.readers.crop import Crop
-from nerif.imaging.readers.views import View, find_views
+from nerif.imaging.readers.views import View, find_views, paired
 from nerif.imaging.recording import Recording, Scene, ViewReference, camera_of, measure_instant
 from nerif.imaging.recording_sequence import frame_numbers, instants_of, measure_recording
 from refusals import refused
 
 SHAPE = (60, 72)
+BLANK = np.zeros((4, 5), np.uint8)
 BOX = Box((-25.0, -25.0, -25.0), (25.0, 25.0, 25.0))
 
 
@@ -63,11 +65,12 @@ def lines() -> list[str]:
     return []
 
 
-def test_views_that_cannot_be_used_are_left_out(recording, lines):
+def test_views_that_cannot_be_used_are_left_out(recording, tmp_path, lines):
     path = recording.views[1].folder / recording.views[1].sources["flow"]
     tifffile.imwrite(path, tifffile.imread(path)[:1])
     cameras = {**recording.cameras, "0deg": replace(recording.cameras["0deg"], background=None)}
-    measurement, _ = measure_instant(replace(recording, cameras=cameras), (2,), lines.append)
+    short = replace(recording, views=find_views(tmp_path), cameras=cameras)
+    measurement, _ = measure_instant(short, (2,), lines.append)
     assert measurement.names == ("120deg",)
     assert any("'0deg' left out: view '0deg': its camera has no background plane" in line for line in lines)
     assert any(
@@ -107,7 +110,7 @@ def test_instant_i_is_flow_image_i_plus_the_offset_of_the_view(recording, tmp_pa
     shifted = replace(recording, views=find_views(tmp_path, frame_offsets=offsets))
     one = replace(shifted, views=shifted.views[:2], images=False)
     numbers = frame_numbers("all", one.views)
-    assert numbers == range(2, 3)  # of three flow images each
+    assert numbers == (2,)  # of three flow images each
     assert instants_of(numbers, one.views[1], 10.0) == (0.2,)
     plain = [measure_instant(replace(recording, images=False), (i,))[0].displacement for i in range(3)]
     assert not torch.equal(plain[0].nan_to_num(), plain[2].nan_to_num())
@@ -143,6 +146,101 @@ def test_instants_without_a_flow_image_in_some_view_are_refused(recording, tmp_p
     with pytest.raises(InputError, match="within none, those of view '60deg'"):
         view.check_instants([0], "frames")
     assert pickle.loads(pickle.dumps(view)) == view  # for another process
+
+
+ALL = range(8)
+NO_4 = [0, 1, 2, 3, 5, 6, 7]
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "instants", "words"),
+    [
+        (ALL, NO_4, (ALL, NO_4), ["view 'b' has no flow image 4;"]),
+        (ALL, range(1, 9), (ALL, ALL), ["b 1 to 8); paired from the first ones, as by --frame-offset b 1"]),
+        ([k + 1 for k in NO_4], ALL, (NO_4, ALL), ["--frame-offset a 1;", "view 'a' has no flow image 5;"]),
+        (ALL, range(1, 8), (ALL, range(1, 8)), ["are one instant: a 0 to 7, b 1 to 7"]),  # it dropped its first one
+        (ALL, range(5, 13), (ALL, range(5, 13)), ["are one instant: a 0 to 7, b 5 to 12"]),
+        (ALL, [500 + k for k in NO_4], (ALL, NO_4), ["--frame-offset b 500;", "has no flow image 504;"]),
+        ([0, 1, 2, 10, 11, 12], [0, 1, 10, 11, 12], ([0, 1, 2, 10, 11, 12], [0, 1, 10, 11, 12]),
+         ["view 'b' has no flow image 2;", "no view has flow image 3 to 9: a gap in time"]),
+        (range(-3, 3), range(-3, 3), (range(6), range(6)), []),
+        (range(0, 80, 10), [10 * k for k in NO_4], (ALL, NO_4), ["view 'b' has no flow image 40;"]),
+        ([1000, 1033, 1067], [1001, 1034, 1066], (range(3), range(3)), ["do not count them", "in the order of their"]),
+        (["a", "c"], ["x", "y"], (range(2), range(2)), ["in the order of their names"]),
+    ],
+)  # fmt: skip
+def test_flow_images_are_paired_by_the_numbers_in_their_names(tmp_path, first, second, instants, words):
+    for name, numbers in (("a", first), ("b", second)):
+        for number in numbers:
+            (tmp_path / name / "flow").mkdir(parents=True, exist_ok=True)
+            tifffile.imwrite(tmp_path / name / "flow" / f"run2_{number:03}.tif".replace("00-", "-00"), BLANK)
+    views = paired(find_views(tmp_path))
+    for view, expected, names in zip(views, instants, (first, second), strict=True):
+        assert view.instants == tuple(expected)
+        name = view.flow_image(view.instants[-1])[1]
+        assert str(names[-1]) in name
+    lines = views[0].count.lines
+    assert len(lines) == len(words)
+    for line, text in zip(lines, words, strict=True):
+        assert text in line
+    everything = sorted({*views[0].instants} | {*views[1].instants})
+    common = [i for i in everything if max(x.instants[0] for x in views) <= i <= min(x.instants[-1] for x in views)]
+    numbers = frame_numbers("all", views)
+    assert numbers == tuple(common)
+    assert instants_of(numbers, views[0], 100.0) == pytest.approx([i / 100 for i in common])
+    assert paired(views) == views
+
+
+@pytest.mark.parametrize(("second", "remedy"), [(range(500, 503), "--frame-offset VIEW"), ("xyz", "number the files")])
+def test_flow_images_that_nothing_pairs_are_refused(tmp_path, second, remedy):
+    for name, numbers in (("a", range(2)), ("b", second)):
+        for number in numbers:
+            (tmp_path / name / "flow").mkdir(parents=True, exist_ok=True)
+            tifffile.imwrite(tmp_path / name / "flow" / f"{number}.tif", BLANK)
+    with pytest.raises(InputError, match=remedy):
+        paired(find_views(tmp_path))
+    stated = paired(find_views(tmp_path, frame_offsets={"b": 0 if second == "xyz" else 500}))
+    assert [len(view.instants) for view in stated] == [2, 3]
+
+
+def test_a_film_of_dropped_frames_has_the_images_of_each_instant(recording, tmp_path, lines):
+    """Two cameras, of which one counts from 1, and dropped its third frame; both were stopped for two frames."""
+    for k, name in enumerate(("0deg", "60deg")):
+        path = tmp_path / name / "flow.tif"
+        images = tifffile.imread(path)
+        path.unlink()
+        (tmp_path / name / "flow").mkdir()
+        for number, image in zip((0, 1, 2, 5), (images[0], images[1], images[2], images[0]), strict=True):
+            if (name, number) != ("60deg", 2):
+                tifffile.imwrite(tmp_path / name / "flow" / f"f{number + k}.tif", image)
+    dropping = replace(recording, views=find_views(tmp_path, ["0deg", "60deg"]), images=False)
+    plain = [measure_instant(dropping, (i,))[0].displacement[-1].nan_to_num() for i in (0, 1)]
+    numbers = frame_numbers("all", dropping.views)
+    film = measure_recording(dropping, numbers, instants_of(numbers, dropping.views[0], 100.0), tmp_path / "f.zarr",
+                             say=lines.append)  # fmt: skip
+    assert film.times == (0.0, 0.01, 0.02, 0.05)
+    assert film.frame(2).names == ("0deg",)
+    assert torch.equal(film.frame(3).displacement[1].nan_to_num(), plain[0])
+    assert not torch.equal(plain[0], plain[1])
+    assert any("frame 2: left out: view '60deg': no flow image of number 2" in line for line in lines)
+    assert film.frame(0).frame_offsets == {"60deg": 1}
+    lines.clear()
+    mean, _ = measure_instant(dropping, range(1, 4), lines.append)
+    assert mean.names == ("0deg", "60deg")
+    assert sum("no flow image of number" in line for line in lines) == 3
+
+
+def test_frames_missing_in_the_times_of_a_film_are_gaps(tmp_path):
+    for name, dropped in (("a", 3), ("b", 5)):
+        (tmp_path / name).mkdir()
+        with h5py.File(tmp_path / name / "flow.h5", "w") as file:
+            kept = np.delete(np.arange(8), dropped)
+            file["images"] = np.broadcast_to(kept[:, None, None], (7, *BLANK.shape)).astype(np.uint8)
+            file["times"] = 12.5 + 0.002 * kept + 1e-5 * np.sin(kept)
+    views = paired(find_views(tmp_path))
+    assert [int(view.flow_image(6)[0][0, 0]) for view in views] == [6, 6]
+    numbers = frame_numbers("all", views)
+    assert instants_of(numbers, views[0], 0.0) == pytest.approx([12.5 + 0.002 * k for k in range(8)], abs=2e-5)
 
 
 OTHER = {
@@ -282,7 +380,7 @@ def test_files_are_opened_once_and_each_page_read_once(tmp_path, monkeypatch):
 
     monkeypatch.setattr(tifffile.TiffFile, "__init__", counting_open)
     monkeypatch.setattr(tifffile.TiffPage, "asarray", counting_read)
-    view = recording.views[0]
+    view = replace(recording.views[0])  # not opened yet
     for number in range(pages):
         frames = view.open("flow")
         view.cropped(frames[number], frames.name(number))

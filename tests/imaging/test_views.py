@@ -105,9 +105,9 @@ def test_frame_offsets_of_the_file_are_read_and_overridden(folder):
     (folder / "views.toml").write_text(
         'flow = "cam2/flow"\nreference = "cam2/reference"\n[views.a]\nframe_offset = -2\n[views.b]\n'
     )
-    assert [view.frame_offset for view in find_views(folder)] == [-2, 0]
+    assert [view.frame_offset for view in find_views(folder)] == [-2, None]
     assert [view.frame_offset for view in find_views(folder, frame_offsets={"b": 3})] == [-2, 3]
-    assert [view.frame_offset for view in find_views(folder, frame_offsets={"a": 0})] == [0, 0]
+    assert [view.frame_offset for view in find_views(folder, frame_offsets={"a": 0})] == [0, None]
     write_crops(folder, {"a": Crop(row=1)})
     assert find_views(folder)[0].frame_offset == -2
 
@@ -200,6 +200,7 @@ def test_images_are_shrunk_and_never_enlarged():
         (["stack8.tif"], ["0", "1"]),
         (["a.tif", "b.tif"], ["0", "1"]),
         (["a1.tif", "b1.tif"], ["0", "1"]),
+        (["pose_-1.tif", "pose_1.tif"], ["-1", "1"]),
     ],
 )
 def test_poses_are_named_by_numbers_in_names(tmp_path, files, expected):

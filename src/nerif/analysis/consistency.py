@@ -165,7 +165,8 @@ def _check_technique(
     valid = measurement.valid_share(measurement.observations[0])
     remarks = image_remarks(measurement, small, valid)
     if len(names) < 3:
-        return Consistency((), (), (*remarks, "fewer than three views: they cannot be compared"))
+        cannot = "fewer than three views: from one instant the check cannot tell whether they show the same flow"
+        return Consistency((), (), (*remarks, cannot))
     corrections: list[Correction] = []
     for _ in range(max(1, len(names) // 2)):
         correction = _most_likely_mistake(small, voxels, on_step)

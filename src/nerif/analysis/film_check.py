@@ -38,6 +38,7 @@ from nerif.analysis.consistency import (
 from nerif.common.conventions import InputError
 from nerif.common.findings import Finding
 from nerif.common.installation import quoted, word_of
+from nerif.common.times import whole_steps
 from nerif.data.measurement import MASKS, Measurement, integrals_of
 from nerif.reconstruction.aperture import apply_aperture
 from nerif.reconstruction.device import on_free_cores
@@ -60,6 +61,8 @@ MIN_COUNT, MAX_CORRELATION = 8, 0.999  # of a band
 class Film(Protocol):
     """What the check needs of a film, such as a MeasurementSequence."""
 
+    @property
+    def times(self) -> Sequence[float]: ...
     def __len__(self) -> int: ...
     def frame(self, index: int) -> Measurement: ...
     def fullest(self) -> Measurement: ...
@@ -67,6 +70,8 @@ class Film(Protocol):
 
 class Excerpt:
     """Some instants of a film, binned, by one technique and the views of its fullest instant; read when needed.
+
+    Instants count the frames by their times: those that no camera recorded have no frame.
 
     Parameters
     ----------
@@ -78,6 +83,9 @@ class Excerpt:
         self.film, self.aperture = film, aperture
         self.names = self.measurement(film.fullest()).names
         self._frames: dict[int, Measurement | None] = {}
+        steps = whole_steps(np.asarray(film.times))
+        self.places = {int(i): k for k, i in enumerate(range(len(film)) if steps is None else steps)}
+        self.length = max(self.places, default=-1) + 1
 
     def measurement(self, frame: Measurement) -> Measurement:
         """Return the first technique of a frame."""
@@ -86,12 +94,12 @@ class Excerpt:
     def frame(self, instant: int) -> Measurement | None:
         """Return a binned frame, None if it lacks a view or is not in the film."""
         if instant not in self._frames:
-            self._frames[instant] = self._read(instant) if 0 <= instant < len(self.film) else None
+            self._frames[instant] = self._read(self.places[instant]) if instant in self.places else None
         return self._frames[instant]
 
-    def _read(self, instant: int) -> Measurement | None:
+    def _read(self, place: int) -> Measurement | None:
         try:
-            frame = self.measurement(self.film.frame(instant))
+            frame = self.measurement(self.film.frame(place))
             return without_spikes(binned(frame.select(self.names), MAX_PIXELS)) if frame.cameras else None
         except InputError:  # not written, or a view has no valid pixel
             return None
@@ -113,10 +121,10 @@ class Excerpt:
 
     def liveliest(self) -> range:
         """Return consecutive instants with all views, between which the flow changes most; empty if there are none."""
-        count = min(INSTANTS, max(len(self.film) - 2 * REACH, len(self.film) // 2))
+        count = min(INSTANTS, max(self.length - 2 * REACH, self.length // 2))
         if count < MIN_INSTANTS:
             return range(0)
-        last = len(self.film) - count
+        last = self.length - count
         margin = min(REACH, last // 2)
         starts = np.unique(np.linspace(margin, last - margin, CANDIDATES).round().astype(int)).tolist()
         changes = {start: self._change(start + count // 2) for start in starts}
@@ -372,17 +380,17 @@ def check_film(
         instant = next((t for t in instants if excerpt.has([t + k for k in late.values()])), None)
         if instant is None:
             instant, late = instants[0], {}
-        measurement = _synchronous(film, instant, late)
+        measurement = _synchronous(excerpt, instant, late)
         remarks.append(f"the views were compared at instant {instant}")
     result = check_consistency(measurement, voxels, on_step, aperture)
     return replace(result, findings=(*findings, *result.findings), remarks=(*remarks, *result.remarks))
 
 
-def _synchronous(film: Film, instant: int, shifts: Mapping[str, int]) -> Measurement:
+def _synchronous(excerpt: Excerpt, instant: int, shifts: Mapping[str, int]) -> Measurement:
     """The measurement of one instant, with some views from frames that many later."""
-    result = film.frame(instant)
+    result = excerpt.film.frame(excerpt.places[instant])
     for name, shift in shifts.items():
-        later = film.frame(instant + shift)
+        later = excerpt.film.frame(excerpt.places[instant + shift])
         i, j = result.names.index(name), later.names.index(name)
 
         def exchanged(ours: Tensor | None, theirs: Tensor | None, i: int = i, j: int = j) -> Tensor | None:

@@ -23,7 +23,7 @@ from nerif.imaging.displacement.displacement import OVEREXPOSED, DisplacementMap
 from nerif.imaging.displacement.repetition import Repetition, repetition
 from nerif.imaging.masks import MaskSettings, flow_mask
 from nerif.imaging.readers.exposure import check_exposure
-from nerif.imaging.readers.views import View, good_images
+from nerif.imaging.readers.views import View, good_images, paired
 from nerif.imaging.reference_outliers import without_outliers
 from nerif.imaging.unrelated import unrelated
 from nerif.imaging.workers import cores, work
@@ -153,6 +153,12 @@ class Recording:
                     field="calibration",
                 )
         check_settings(self)
+        object.__setattr__(self, "views", paired(self.views))
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Lines about how the flow images of the views are paired."""
+        return next((view.count.lines for view in self.views if view.count is not None), ())
 
     def processes(self, tasks: int, images: int) -> int:
         """Return the number of processes for tasks with `images` images in total: 1 if these are small."""
@@ -217,7 +223,12 @@ class ViewReference:
     def measure(self, numbers: Sequence[int], say: Callable[[str], None] = silent) -> ViewMeasurement:
         """Return camera, mean displacement over the flow images of these instants, and flow mask."""
         images = {}
+        cause, name = "", f"view '{self.view.name}'"
         for i in numbers:
+            if len(numbers) > 1 and i not in self.view.instants:
+                cause = f"no flow image of number {i}"
+                say(f"left out: view '{self.view.name}': {cause}")
+                continue
             image, name = self.view.flow_image(i)
             if exposure := check_exposure(image, self.reference.full_scale, name):
                 say(f"note: {exposure}")
@@ -234,7 +245,7 @@ class ViewReference:
         if mask is None and self.masks is not None:
             d = np.where(result.valid[..., None], result.displacement, np.nan)
             mask = flow_mask(d, result.sigma, self.masks)
-        return ViewMeasurement(self.camera, result, mask, self.view.frame_offset)
+        return ViewMeasurement(self.camera, result, mask, self.view.offset)
 
     def _unrelated(self, image: np.ndarray) -> str:
         """Cause of a flow image that shows another scene, or ""; a background that repeats correlates with any."""
@@ -331,6 +342,8 @@ def measure_instant(
     views = recording.views
     results: dict[int, ViewMeasurement] = {}
     errors = []
+    for note in recording.notes:
+        say(f"note: {note}")
     tasks = [(view, tuple(numbers)) for view in views]
     if processes is None:
         processes = recording.processes(len(views), len(views))

@@ -69,18 +69,23 @@ def measure_frame(
     return join_views(results, scene), errors
 
 
-def frame_numbers(text: str, views: Sequence[View]) -> range:
-    """Return the instants of "all" or FIRST:LAST (LAST excluded), of which every view must have a flow image."""
+def frame_numbers(text: str, views: Sequence[View]) -> tuple[int, ...]:
+    """Return the instants of "all" or FIRST:LAST (LAST excluded) of which some view has a flow image.
+
+    The first and last one of every view must include them: those between that it lacks were dropped by its camera.
+    """
+    starts, stops = ([view.instants[k] for view in views if view.instants] for k in (0, -1))
+    every = {i for view in views for i in view.instants}
     if text == "all":
-        common = range(max(view.instants.start for view in views), min(view.instants.stop for view in views))
-        if not common:
+        common = [i for i in sorted(every) if max(starts) <= i <= min(stops)] if len(starts) == len(views) else []
+        if not any(all(i in view.instants for view in views) for i in common):
             ranges = ", ".join(f"{view.name} {words_of_range(view.instants)}" for view in views)
             raise InputError(
                 f"expected instants of which every view has a flow image, got none in common ({ranges}); correct the "
                 "frame offsets, or choose --views",
                 field="frames",
             )
-        return common
+        return tuple(common)
     try:
         first, last = (int(word) for word in text.split(":"))
         if not 0 <= first < last:
@@ -89,22 +94,22 @@ def frame_numbers(text: str, views: Sequence[View]) -> range:
         raise InputError(f"expected all, or FIRST:LAST such as 0:400, got '{text}'", field="frames") from None
     for view in views:
         view.check_instants(range(first, last), "frames")
-    return range(first, last)
+    return tuple(sorted(every & {*range(first, last)}))
 
 
-def instants_of(numbers: range, view: View, frame_rate: float) -> tuple[float, ...]:
+def instants_of(numbers: Sequence[int], view: View, frame_rate: float) -> tuple[float, ...]:
     """Return the times of instants, s, by the frame rate (1/s) or, if it is 0, by the recording of a view."""
     if frame_rate > 0:
         return tuple(i / frame_rate for i in numbers)
-    times = [time for i in numbers if (time := view.flow_time(i)) is not None]
-    if not times:
+    times = view.flow_times(numbers)
+    if times is None:
         raise InputError("expected frames per second, as the images have no times; got none", field="frame_rate")
-    return tuple(times)
+    return times
 
 
 def measure_recording(
     recording: Recording,
-    numbers: range,
+    numbers: Sequence[int],
     times: Sequence[float],
     out: Path,
     settings: dict[str, Any] | None = None,
@@ -126,10 +131,14 @@ def measure_recording(
     on_step : called with the number of views with evaluated references plus that of finished frames
     processes : 1 for this one only; by default one per core if the images are large
     """
-    offsets = {view.name: view.frame_offset for view in recording.views if view.frame_offset}
-    settings = {**(settings or {}), "frames": [numbers.start, numbers.stop], **({OFFSET: offsets} if offsets else {})}
+    offsets = {view.name: view.offset for view in recording.views if view.offset}
+    settings = {**(settings or {}), "frames": [numbers[0], numbers[-1] + 1], **({OFFSET: offsets} if offsets else {})}
+    if len(numbers) < numbers[-1] + 1 - numbers[0]:
+        settings["frames"] = list(numbers)
     settings = json.loads(json.dumps(settings, default=str))
     sequence = _existing(out, settings) if out.exists() and not force else None
+    for note in recording.notes:
+        say(f"note: {note}")
     references = references_of(recording, say, on_step, processes)
     if sequence is not None:
         _check_cameras(out, [view.camera for view in references])
@@ -201,7 +210,7 @@ def _camera_numbers(camera: Camera) -> dict[str, Tensor]:
 
 
 def _create(
-    references: Sequence[ViewReference], scene: Scene, numbers: range, times: Sequence[float], out: Path,
+    references: Sequence[ViewReference], scene: Scene, numbers: Sequence[int], times: Sequence[float], out: Path,
     settings: dict[str, Any], force: bool, say: Callable[[str], None],
 ) -> MeasurementSequence:  # fmt: skip
     """A new store with the first frame that has all views, whose notes stand for those of all frames."""
@@ -225,7 +234,9 @@ def _create(
     raise InputError(f"no frame in which every view could be used; {reasons[0]}; choose --views")
 
 
-def _write_frame(common: tuple[Sequence[ViewReference], Scene, MeasurementSequence, range], index: int) -> list[str]:
+def _write_frame(
+    common: tuple[Sequence[ViewReference], Scene, MeasurementSequence, Sequence[int]], index: int
+) -> list[str]:
     """Measure and write one frame; return the errors of views that are left out."""
     references, scene, sequence, numbers = common
     try:

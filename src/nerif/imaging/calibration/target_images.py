@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -12,6 +11,7 @@ from nerif.common.conventions import InputError
 from nerif.imaging.calibration.target_diagnosis import explain
 from nerif.imaging.calibration.targets import CalibrationTarget, Detection, ViewImages
 from nerif.imaging.readers.exposure import full_scale
+from nerif.imaging.readers.frame_numbers import words_of_names
 from nerif.imaging.readers.frames import Frames, read_each
 from nerif.imaging.readers.views import View
 
@@ -105,6 +105,6 @@ def pose_names(frames: Frames) -> list[str]:
     pose_007.png of one camera and cam2-7.tif of another are the same pose.
     """
     names = [frames.name(i) for i in range(len(frames))]
-    numbers = [re.findall(r"\d+", Path(name).stem if " frame " not in name else name) for name in names]
-    last = [str(int(n[-1])) if n else "" for n in numbers]
+    words = words_of_names([Path(name).stem if " frame " not in name else name for name in names])
+    last = [next((str(w) for w in reversed(of_name) if isinstance(w, int)), "") for of_name in words]
     return last if len(set(last)) == len(last) and all(last) else [str(i) for i in range(len(names))]

@@ -17,6 +17,7 @@ import numpy as np
 
 from nerif.common.conventions import InputError
 from nerif.common.memory import check_memory
+from nerif.common.times import whole_steps
 from nerif.imaging.readers.mosaic import bayer_pattern, phase_means
 
 if TYPE_CHECKING:
@@ -73,6 +74,12 @@ class Frames(ABC):
 
     @abstractmethod
     def __len__(self) -> int: ...
+
+    @property
+    def numbers(self) -> np.ndarray | None:
+        """Number of each frame, increasing, with gaps where the times or names have them; None if names have none."""
+        steps = None if self.times is None else whole_steps(self.times)
+        return np.arange(len(self)) if steps is None else steps
 
     @abstractmethod
     def name(self, i: int) -> str:
@@ -181,6 +188,15 @@ class SelectedFrames(Frames):
 
     def load(self, i: int) -> np.ndarray:
         return self._frames.load(self._indices[i])
+
+    @property
+    def numbers(self) -> np.ndarray | None:
+        """Number of each frame; a selection begins with 0, as it may have been made to pair the frames of cameras."""
+        numbers = self._frames.numbers
+        if numbers is None or not self._indices or (np.diff(self._indices) < 0).any():
+            return np.arange(len(self)) if numbers is not None else None
+        selected = numbers[list(self._indices)]
+        return selected - selected[0]
 
     @property
     def notes(self) -> tuple[str, ...]:  # type: ignore[override]

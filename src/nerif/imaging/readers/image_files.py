@@ -20,6 +20,7 @@ from nerif.common.files import ending
 from nerif.common.image_names import RAW
 from nerif.common.installation import install
 from nerif.imaging.readers.camera_raw import CameraRaw
+from nerif.imaging.readers.frame_numbers import numbers_in_names
 from nerif.imaging.readers.frames import Frames, check_count, check_size
 from nerif.imaging.readers.image_file import ImageFile
 from nerif.imaging.readers.packed import unpack
@@ -63,6 +64,15 @@ class FileFrames(Frames):
 
     def __len__(self) -> int:
         return len(self._places)
+
+    @property
+    def numbers(self) -> np.ndarray | None:
+        counts, size = np.array(self._counts), self._counts[0]
+        of_files = numbers_in_names(self._names) if len(counts) > 1 else np.zeros(1, np.int64)
+        if of_files is None or (counts[:-1] != size).any() or counts[-1] > size:
+            return None
+        of_frames = of_files if np.gcd.reduce(np.diff(of_files)) % size == 0 else of_files * size
+        return np.concatenate([n + np.arange(count) for n, count in zip(of_frames, counts, strict=True)])
 
     def name(self, i: int) -> str:
         k, inner = self._places[i]

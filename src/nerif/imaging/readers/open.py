@@ -22,6 +22,7 @@ from nerif.common.image_names import ARRAYS, FOLDER_SUFFIXES, HDF5, PHOTRON, SIN
 from nerif.imaging.readers.array_files import ArrayFrames, Hdf5Frames
 from nerif.imaging.readers.binning import binned_mask
 from nerif.imaging.readers.cine import CineFrames
+from nerif.imaging.readers.frame_numbers import natural_order
 from nerif.imaging.readers.frames import Frames, SelectedFrames, size_in_words
 from nerif.imaging.readers.image_files import FileFrames
 from nerif.imaging.readers.photron import PhotronFrames
@@ -147,7 +148,7 @@ def _find_files(path: Path, base: Path | None) -> list[Path]:
     else:
         raise InputError(f"no such file or folder{_nearest(path, base)}", field=label)
     _check_twins(files, label)
-    return sorted(files, key=_natural)
+    return [files[k] for k in natural_order([path.as_posix() for path in files])]
 
 
 def _content(paths: list[Path], base: Path | None) -> str:
@@ -189,8 +190,3 @@ def _nearest(path: Path, base: Path | None) -> str:
 def _label(path: Path, base: Path | None) -> str:
     inside = base is not None and path.is_relative_to(base) and path != base
     return (path.relative_to(base) if base is not None and inside else path).as_posix()
-
-
-def _natural(path: Path) -> tuple[list[tuple[int, int, str]], str]:
-    words = re.findall(r"\d+|\D+", path.as_posix())
-    return [(0, int(w), "") if w.isdecimal() else (1, 0, w.lower()) for w in words], path.as_posix()

@@ -26,6 +26,7 @@ import re
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
+from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
 from typing import overload
@@ -40,12 +41,13 @@ from nerif.data.kinds import EXPERIMENT, reading_as
 from nerif.imaging.readers.binning import bin_mosaics
 from nerif.imaging.readers.crop import Crop
 from nerif.imaging.readers.exposure import check_exposure, full_scale
+from nerif.imaging.readers.frame_numbers import Count, common_count
 from nerif.imaging.readers.frames import Frames, read_each, size_in_words
 from nerif.imaging.readers.mosaic import PATTERNS
 from nerif.imaging.readers.open import open_frames, read_mask
 
 __all__ = [
-    "BEFORE", "SOURCES", "VIEWS", "Images", "View", "find_views", "good_images", "read_sample", "views_file",
+    "BEFORE", "SOURCES", "VIEWS", "Images", "View", "find_views", "good_images", "paired", "read_sample", "views_file",
     "words_of_range", "write_crops",
 ]  # fmt: skip
 
@@ -72,7 +74,8 @@ class View:
     sources : arguments of open_frames, by the names of SOURCES
     crop : the view's part of each frame
     mosaic : Bayer pattern of its raw images, such as RGGB, or "none"; "" where it is in the metadata or is recognised
-    frame_offset : instant i of the measurement is flow image i + frame_offset of this view
+    frame_offset : instant i of the measurement is flow image i + frame_offset of this view; None if it is not stated
+    count : that pairs the flow images of all views (`paired`); None: of this view alone
     """
 
     name: str
@@ -80,7 +83,8 @@ class View:
     sources: dict[str, str]
     crop: Crop | None = None
     mosaic: str = ""
-    frame_offset: int = 0
+    frame_offset: int | None = None
+    count: Count | None = field(default=None, repr=False)
     _opened: dict[str, Frames] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -88,7 +92,7 @@ class View:
 
     def __reduce__(self) -> tuple[type[View], tuple[object, ...]]:
         """State for another process, which opens the files itself."""
-        return View, (self.name, self.folder, self.sources, self.crop, self.mosaic, self.frame_offset)
+        return View, tuple(getattr(self, f.name) for f in fields(self) if f.init)
 
     def open(self, source: str) -> Frames:
         """Return the frames of a source, opened once."""
@@ -125,32 +129,49 @@ class View:
         override = "" if self.mosaic else '; mosaic = "none" in views.toml keeps all pixels'
         return *frames.notes, line + override
 
+    @cached_property
+    def _places(self) -> dict[int, int]:
+        """Places of the flow images by their instants."""
+        frames = self.open("flow")
+        numbers = np.arange(len(frames)) if frames.numbers is None else frames.numbers
+        count = self.count or common_count({self.name: numbers}, {self.name: self.frame_offset})
+        return {int(i): k for k, i in enumerate(count.instants(self.name, numbers)) if i >= 0}
+
     @property
-    def instants(self) -> range:
+    def offset(self) -> int:
+        """Frame offset, stated or by the numbers of the flow images."""
+        return self.frame_offset or 0 if self.count is None else self.count.offsets[self.name]
+
+    @property
+    def instants(self) -> tuple[int, ...]:
         """Numbers of the instants of which the view has a flow image."""
-        return range(max(0, -self.frame_offset), len(self.open("flow")) - self.frame_offset)
+        return tuple(self._places)
 
     def check_instants(self, numbers: Sequence[int], parameter: str) -> None:
-        """Raise an InputError that names a parameter, unless the view has a flow image of all these instants."""
-        if min(numbers) in self.instants and max(numbers) in self.instants:
+        """Raise an InputError that names a parameter, unless these instants are within those of the flow images."""
+        if self.instants and min(numbers) >= self.instants[0] and max(numbers) <= self.instants[-1]:
             return
-        got = words_of_range(range(min(numbers), max(numbers) + 1))
-        offset = f", frame offset {self.frame_offset}" if self.frame_offset else ""
+        offset = f", frame offset {self.offset}" if self.offset else ""
         raise InputError(
             f"expected numbers within {words_of_range(self.instants)}, those of view '{self.name}' "
-            f"({len(self.open('flow'))} flow images{offset}), got {got}",
+            f"({len(self.open('flow'))} flow images{offset}), got {words_of_range(numbers)}",
             field=parameter,
         )
 
     def flow_image(self, instant: int) -> tuple[np.ndarray, str]:
         """Return the flow image of an instant, cropped, and its name."""
-        frames, i = self.open("flow"), instant + self.frame_offset
+        frames = self.open("flow")
+        if instant not in self._places:
+            raise InputError(f"no flow image of number {instant}: a gap in {self.sources['flow']}")
+        i = self._places[instant]
         return self.cropped(frames[i], frames.name(i)), frames.name(i)
 
-    def flow_time(self, instant: int) -> float | None:
-        """Return the recording time of a flow image, s; None if the file has none."""
-        times = self.open("flow").times
-        return None if times is None else float(times[instant + self.frame_offset])
+    def flow_times(self, numbers: Sequence[int]) -> tuple[float, ...] | None:
+        """Return the recording times of instants, s, interpolated where a frame is missing; None without times."""
+        times, places = self.open("flow").times, self._places
+        if times is None:
+            return None
+        return tuple(np.interp(numbers, list(places), times[list(places.values())]).tolist())
 
     @property
     def full_scale(self) -> float:
@@ -193,8 +214,31 @@ class View:
         return self.crop(image, name) if self.crop else image
 
 
-def words_of_range(numbers: range) -> str:
-    """Return a range in words, such as 0 to 9."""
+def paired(views: Sequence[View]) -> tuple[View, ...]:
+    """Return the views with their flow images counted in common; those that cannot be opened stay as they are."""
+    numbers: dict[str, np.ndarray] = {}
+    lengths: dict[str, int] = {}
+    for view in views:
+        try:
+            frames = view.open("flow")
+        except InputError:  # reported where they are read
+            continue
+        lengths[view.name] = len(frames)
+        if frames.numbers is not None:
+            numbers[view.name] = frames.numbers
+    places = {name: numbers.get(name, np.arange(length)) for name, length in lengths.items()}
+    if not places:
+        return tuple(views)
+    count = common_count(places, {view.name: view.frame_offset for view in views}, len(numbers) < len(lengths))
+    result = []
+    for view in views:
+        result.append(replace(view, count=count) if view.name in lengths else view)
+        result[-1]._opened.update(view._opened)
+    return tuple(result)
+
+
+def words_of_range(numbers: Sequence[int]) -> str:
+    """Return the first and the last of some numbers in words, such as 0 to 9."""
     return f"{numbers[0]} to {numbers[-1]}" if numbers else "none"
 
 
@@ -292,7 +336,7 @@ def _from_file(file: Path) -> list[View]:
             if k in SOURCES
         }
         crop_of_view = Crop(**crop) if crop else None
-        views.append(View(name, file.parent, sources, crop_of_view, mosaic, entries.get(OFFSET, 0)))
+        views.append(View(name, file.parent, sources, crop_of_view, mosaic, entries.get(OFFSET)))
     return views
 
 
