@@ -209,6 +209,13 @@ def test_natural_order(tmp_path, stack8):
     (folder / "notes.txt").write_text("x")
     for spec, expected in (("", stack8), ("*", stack8), ("img?.png", stack8[:2]), ("*.png[1:]", stack8[1:])):
         same(open_frames(f"{folder}/{spec}"), expected)
+    for names in (("run_-3", "run_-2", "run_0", "run_2"), ("run-3", "run-2", "run0", "run2"), ("-11", "-2", "0", "7")):
+        below = tmp_path / names[0]
+        below.mkdir()
+        for image, name in zip(stack8, names, strict=True):
+            write_cv(below / f"{name}.png", image)
+        same(open_frames(below), stack8)
+        assert open_frames(below).numbers[-1] == int(names[-1].strip("run_"))
 
 
 # --- Photron
@@ -754,6 +761,52 @@ def test_large_stacks_of_imagej_have_one_page(tmp_path, stack12):
     good, errors = good_frames(open_frames(tmp_path / "short.tif"))
     assert good == [0, 1, 2]
     assert [name for name in errors if name.endswith("short.tif frame 3")]
+
+
+def test_images_of_a_stack_that_imagej_saved_one_by_one(tmp_path, stack8):
+    for i, image in enumerate(stack8):
+        description = f"ImageJ=1.54f\nimages={len(stack8)}\nslices={len(stack8)}\nloop=false\n"
+        write_tiff(tmp_path / f"s{i:04}.tif", image, photometric="minisblack", description=description, metadata=None)
+    frames = open_frames(tmp_path)
+    same(frames, stack8)
+    assert frames.numbers.tolist() == list(range(len(stack8)))
+
+
+CHANNELS = [
+    ({"imagej": True, "metadata": {"axes": "TCYX"}}, (3, 2), "0::2"),
+    ({"imagej": True, "metadata": {"axes": "TCYX"}}, (2, 3), "0::3"),
+    ({"ome": True, "metadata": {"axes": "TCYX"}}, (3, 2), "0::2"),
+    ({"ome": True, "metadata": {"axes": "CTYX"}}, (2, 3), "0:3"),
+]
+
+
+@pytest.mark.parametrize(("options", "shape", "selection"), CHANNELS)
+def test_channels_of_one_stack_are_no_frames(tmp_path, rng, options, shape, selection):
+    stack = rng.integers(0, 4000, (*shape, 7, 10), dtype=np.uint16)
+    write_tiff(tmp_path / "two.tif", stack, photometric="minisblack", **options)
+    with pytest.raises(InputError, match=f"got images of {shape[options['metadata']['axes'].index('C')]} ") as error:
+        open_frames("two.tif", tmp_path)
+    assert f"'two.tif[{selection}]'" in str(error.value)
+    if shape[0] == 3:
+        for i, image in enumerate(stack):
+            apart = {**options, "metadata": {"axes": "CYX"}}
+            write_tiff(tmp_path / f"one{i}.tif", image, photometric="minisblack", **apart)
+        same(open_frames("one*.tif[1::2]", tmp_path), stack[:, 1])
+        with pytest.raises(InputError, match=r"'one\*.tif\[0::2\]'"):
+            open_frames("one*.tif", tmp_path)
+    first = stack[:, 0] if selection.startswith("0::") else stack[0]
+    same(open_frames(f"two.tif[{selection}]", tmp_path), first)
+
+
+def test_films_of_imagej_and_ome_have_one_channel(tmp_path, rng):
+    stack = rng.integers(0, 4000, (4, 7, 10), dtype=np.uint16)
+    for axes in ("TYX", "ZYX"):
+        for options in ({"imagej": True}, {"ome": True}):
+            write_tiff(tmp_path / "s.tif", stack, photometric="minisblack", metadata={"axes": axes}, **options)
+            same(open_frames(tmp_path / "s.tif"), stack)
+    colours = rng.integers(0, 255, (2, 7, 10, 3), dtype=np.uint8)
+    write_tiff(tmp_path / "rgb.tif", colours, photometric="rgb", ome=True, metadata={"axes": "TYXS"})
+    assert len(open_frames(tmp_path / "rgb.tif")) == 2
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))

@@ -17,7 +17,8 @@ from nerif.common.conventions import InputError
 from nerif.common.files import atomic, read_json
 from nerif.common.installation import install
 from nerif.common.memory import check_memory
-from nerif.common.netcdf import reading, values
+from nerif.common.netcdf import reading
+from nerif.common.times import check_interval, interval, seconds
 from nerif.data.kinds import SEQUENCE, known_conventions, reading_as
 from nerif.data.measurement import Measurement
 from nerif.data.measurement_file import BODIES, CONVENTIONS, PLAIN, map_names, variables
@@ -116,6 +117,8 @@ class MeasurementSequence:
 
     @classmethod
     def _read(cls, path: Path) -> MeasurementSequence:
+        import numpy as np
+
         _check_arrays(path)
         with _opened(path) as dataset:
             conventions = dataset.attrs.get("Conventions")
@@ -131,8 +134,11 @@ class MeasurementSequence:
                     )
             count = dataset.sizes["time"]
             check_memory(BYTES_OF_TIME * count, path, path)
-            times = tuple(map(float, values(dataset["time"]).tolist() if "time" in dataset.coords else range(count)))
-        check_instants(times, path)
+            time = dataset.coords.get("time")
+            units = None if time is None else time.attrs.get("units")
+            times = tuple(map(float, seconds(np.arange(count) if time is None else time.values, units, path)))
+            check_instants(times, path)
+            check_interval(times, dataset.attrs, path)
         return cls(path, times)
 
     def frame(self, index: int) -> Measurement:
@@ -208,7 +214,7 @@ class MeasurementSequence:
         # format 3 has no type for texts of fixed length
         names = {k: (k, fixed[k].values.astype(object)) for k in ("view", "component") if k in fixed.coords}
         time = ("time", np.asarray(times, dtype=np.float64), {"units": "s", "axis": "T"})
-        fixed = fixed.assign_coords(names).assign_coords(time=time)
+        fixed = fixed.assign_coords(names).assign_coords(time=time).assign_attrs(interval(times))
         with atomic(path) as part:
             fixed.to_zarr(part, mode="w", consolidated=False, zarr_format=ZARR_FORMAT)
             group = zarr.open_group(part, mode="r+")

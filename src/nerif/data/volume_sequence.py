@@ -12,6 +12,7 @@ from nerif.common.conventions import InputError, ambient_index
 from nerif.common.files import atomic
 from nerif.common.memory import check_memory
 from nerif.common.netcdf import reading
+from nerif.common.times import check_interval, interval, seconds
 from nerif.data.kinds import SEQUENCE_RESULT, TRUE_SEQUENCE, Kind, check_kind, reading_as
 from nerif.data.measurement_sequence import ZARR_FORMAT, add_frames, check_instants, check_store, require_zarr
 from nerif.data.volume import Volume, describe, field_of, name_of
@@ -85,11 +86,13 @@ class VolumeSequence:
             )
         with reading(f"{path}: expected volumes over time, written by nerif"):
             z, y, x = (self.array(a).shape[0] for a in "zyx")
-            self.times = tuple(float(t) for t in self.read("time", slice(None)))
+            time = self.read("time", slice(None)), self.array("time").attrs.get("units")
             box = Box(tuple(self.attributes["box_lower_mm"]), tuple(self.attributes["box_upper_mm"]))
             self.n_ambient = ambient_index(self.attributes["n_ambient"])
             self.grid = Grid(box, (z, y, x))
+        self.times = tuple(map(float, seconds(*time, path)))
         check_instants(self.times, path)
+        check_interval(self.times, self.attributes, path)
 
     @classmethod
     def create(
@@ -126,6 +129,7 @@ class VolumeSequence:
                 "n_ambient": n_ambient,
                 "box_lower_mm": list(grid.box.lower),
                 "box_upper_mm": list(grid.box.upper),
+                **interval(times),
                 **(attributes or {}),
             },
         )

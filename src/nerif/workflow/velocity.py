@@ -19,6 +19,8 @@ from nerif.common.conventions import InputError
 from nerif.common.files import atomic, ending
 from nerif.common.interruption import if_interrupted
 from nerif.common.locks import locked
+from nerif.common.times import check_interval, interval, same_instants
+from nerif.data.kinds import SEQUENCE, kind_of
 from nerif.data.measurement_sequence import MeasurementSequence, check_store
 from nerif.data.velocity_sequence import COMPONENTS, VelocitySequence
 from nerif.data.volume import INDEX
@@ -150,6 +152,9 @@ def _improvement(
         if measurement is not None:
             raise InputError("expected none with --density film, which does not need it", field="measurement")
         return None
+    path = measurement or film.attributes.get("measurement")
+    if path is not None and kind_of(path) is SEQUENCE:
+        check_interval(film.times, interval(MeasurementSequence.read(path).times), film.path)
     try:
         return FilmDensity(theta, film.grid, _projectors(film, frames, measurement), film.n_ambient)
     except InputError as error:
@@ -168,7 +173,7 @@ def _projectors(film: VolumeSequence, frames: slice, measurement: str | os.PathL
     if about.get("symmetry"):
         raise InputError("expected a film without symmetry; give --density film", field=film.path)
     sequence = MeasurementSequence.read(path)
-    if sequence.times[frames] != film.times[frames]:
+    if not same_instants(sequence.times[frames], film.times[frames]):
         raise InputError(
             "expected the instants of the film, got others; give another --measurement, or --density film",
             field=sequence.path,

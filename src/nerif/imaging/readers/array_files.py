@@ -13,6 +13,7 @@ from nerif.common.files import ending
 from nerif.common.hdf5 import open_hdf5
 from nerif.common.memory import check_memory
 from nerif.common.npz import open_npz
+from nerif.common.times import seconds
 from nerif.imaging.readers.frames import Frames, check_count, check_size
 
 if TYPE_CHECKING:
@@ -98,7 +99,8 @@ class Hdf5Frames(Frames):
                 times = data.attrs.get("times", data.parent.get("times"))
                 if times is not None:
                     check_memory(times.size * times.dtype.itemsize, path, f"{name}: times")
-                    times = np.array(times, dtype=float).ravel()
+                    unit = getattr(times, "attrs", {}).get("units")
+                    times = seconds(np.array(times).ravel(), unit, name)
                 self._transposed = MATLAB in data.attrs
         except InputError:
             raise

@@ -85,6 +85,10 @@ class Frames(ABC):
     def name(self, i: int) -> str:
         """Return the name of frame `i` in messages, such as ``cam1/ref_003.tif`` or ``rec.mraw frame 17``."""
 
+    def channel(self, i: int) -> int:
+        """Return the channel of frame `i`, such as a colour, where frames alternate between some."""
+        return 0
+
     @abstractmethod
     def load(self, i: int) -> np.ndarray:
         """Return frame `i` as stored, unchecked."""
@@ -185,6 +189,9 @@ class SelectedFrames(Frames):
 
     def name(self, i: int) -> str:
         return self._frames.name(self._indices[i])
+
+    def channel(self, i: int) -> int:
+        return self._frames.channel(self._indices[i])
 
     def load(self, i: int) -> np.ndarray:
         return self._frames.load(self._indices[i])

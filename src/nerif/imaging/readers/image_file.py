@@ -19,6 +19,8 @@ class ImageFile(ABC):
     """Grey value of a saturated pixel in the metadata."""
     cfa: str | None = None
     """Bayer pattern in the metadata."""
+    channels: tuple[int, int] = (1, 1)
+    """The number of channels, such as colours, and how many images of one follow one another."""
     notes: tuple[str, ...] = ()
     """Warnings about the file."""
 

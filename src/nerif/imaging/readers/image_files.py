@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import re
 import struct
 import weakref
@@ -78,6 +79,16 @@ class FileFrames(Frames):
         k, inner = self._places[i]
         return self._names[k] if self._counts[k] == 1 else f"{self._names[k]} frame {inner}"
 
+    @cached_property
+    def _channels(self) -> tuple[int, int]:
+        count, size = self._metadata(lambda file, _: file.channels, (1, 1))
+        only_channels = count == self._counts[0]  # programs that do not know what a stack holds write its frames so
+        return (1, 1) if only_channels and (len(self._files) == 1 or count > MOST_CHANNELS) else (count, size)
+
+    def channel(self, i: int) -> int:
+        count, size = self._channels
+        return self._places[i][1] // size % count
+
     def load(self, i: int) -> np.ndarray:
         k, inner = self._places[i]
         try:
@@ -134,7 +145,10 @@ class Tiff(ImageFile):
         if self._stack:
             page: Any = pages[0]
             check_size(page.shape, path, page.dtype.itemsize)
-            check_count(self._stack, path.stat().st_size / page.nbytes, "the stack of ImageJ")
+            stored = (path.stat().st_size - page.dataoffsets[0]) / page.nbytes
+            if stored < 2:  # one image of a stack that ImageJ saved as a sequence, with the description of the stack
+                self._stack = 0
+            check_count(self._stack, stored, "the stack of ImageJ")
 
     def __len__(self) -> int:
         return self._stack or len(self._pages) + self._is_truncated()
@@ -206,6 +220,10 @@ class Tiff(ImageFile):
             image = TURNED[orientation](image)
         image = np.right_shift(image, 16 - bits) if 8 < bits < 16 else image
         return _inverted(image, bits) if page.photometric == MIN_IS_WHITE else _as_rgb(image)
+
+    @property
+    def channels(self) -> tuple[int, int]:  # type: ignore[override]
+        return _channels(self._tiff, len(self))
 
     @property
     def notes(self) -> tuple[str, ...]:  # type: ignore[override]
@@ -346,6 +364,7 @@ def _lvpyio() -> Any:
     return lvpyio
 
 
+MOST_CHANNELS = 4
 NO_COMPRESSION, LOWEST_BIT_FIRST = 1, 2  # compression and fill order of TIFF
 MIN_IS_WHITE, PALETTE, CFA = 0, 3, 32803  # photometric interpretations of TIFF
 PNG_PALETTE = 3  # colour type
@@ -373,6 +392,19 @@ def _images_of_imagej(tiff: Any) -> int:
     page: Any = tiff.pages[0]
     count = int((tiff.imagej_metadata or {}).get("images", 1))
     return count if count > 1 and page.compression == 1 and len(page.dataoffsets) == 1 else 0
+
+
+def _channels(tiff: Any, images: int) -> tuple[int, int]:
+    """The number of channels of a stack of ImageJ or OME, and how many images of one follow one another."""
+    if tiff.is_imagej:
+        return int((tiff.imagej_metadata or {}).get("channels", 1)), 1
+    text = tiff.ome_metadata or ""
+    sizes = {axis: int(n) for axis, n in re.findall(r'\bSize([CZT])="(\d+)"', text)}
+    order = re.search(r'DimensionOrder="XY([CZT]{3})"', text)
+    samples = tiff.pages[0].samplesperpixel
+    if order is None or len(sizes) < 3 or math.prod(sizes.values()) != images * samples:  # or one file per channel
+        return 1, 1
+    return sizes["C"] // samples, math.prod(sizes[axis] for axis in order[1].partition("C")[0])
 
 
 def _inverted(image: np.ndarray, bits: int) -> np.ndarray:

@@ -61,7 +61,16 @@ def open_frames(spec: str | Path, base: Path | None = None) -> Frames:
     path = root / Path(text).expanduser()
     files = _find_files(path, base)
     frames = _open_files(files, [_label(file, base) for file in files], dataset)
-    return _select(frames, selection, _label(path, base)) if selection else frames
+    frames = _select(frames, selection, _label(path, base)) if selection else frames
+    channels = [frames.channel(i) for i in range(len(frames))]
+    if count := max(channels) - min(channels):
+        part = f"0::{count + 1}" if channels[0] != channels[1] else f"0:{channels.index(1)}"
+        raise InputError(
+            f"expected one channel, got images of {count + 1} (colours, cameras) in one stack; name one in views.toml: "
+            f"'{_label(path, base)}[{part}]'",
+            field=_label(path, base),
+        )
+    return frames
 
 
 def read_mask(

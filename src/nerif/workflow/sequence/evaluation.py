@@ -11,6 +11,7 @@ from nerif.analysis.evaluation import check_inside
 from nerif.analysis.metrics import volume_errors
 from nerif.common.conventions import InputError
 from nerif.common.files import write_json
+from nerif.common.times import same_instants
 from nerif.data.volume import INDEX
 from nerif.data.volume_sequence import VolumeSequence
 from nerif.forward.registry import ASSUMED, technique
@@ -34,7 +35,7 @@ def evaluate_sequence(
     on_frame : called with the numbers of frames compared and to compare
     """
     store, true = SequenceStore(Path(result)), VolumeSequence(truth)
-    if len(store) != len(true) or any(abs(a - b) > 1e-9 for a, b in zip(store.times, true.times, strict=True)):
+    if not same_instants(store.times, true.times):
         raise InputError(f"expected the instants of {result}, {len(store)} frames, got others", field=truth)
     check_inside(Path(truth), true.grid.box, store.grid.box)
     quantity = technique(store.attributes.get("techniques", [ASSUMED.name])[0]).quantity
