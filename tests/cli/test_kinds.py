@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import re
+import shlex
 import shutil
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +39,8 @@ from nerif.workflow.sequence.store import SequenceStore
 FILES = {
     "m.nc": kinds.MEASUREMENT, "volume.nc": kinds.VOLUME, "volume.vti": kinds.VOLUME, "result": kinds.RESULT,
     "films.zarr": kinds.SEQUENCE, "truth.zarr": kinds.TRUE_SEQUENCE, "store.zarr": kinds.SEQUENCE_RESULT,
-    "velocity.zarr": kinds.VELOCITY,
+    "velocity.zarr": kinds.VELOCITY, "film.nc": kinds.FILM_FILE, "fields.nc": kinds.FILM_FILE,
+    "old.zarr": kinds.FORMAT_2, "inside.zip": kinds.ZIPPED_CONTENT, "films.zarr.zip": kinds.ZIPPED,
     "lab": kinds.EXPERIMENT, "listed": kinds.EXPERIMENT, "lab/cam1": kinds.VIEW, "listed/views.toml": kinds.VIEWS,
     "lab/cam1/flow": kinds.IMAGES, "lab/cam1/flow/1.TIF": kinds.IMAGES, "d.npy": kinds.ARRAYS,
     "calibration.toml": kinds.CALIBRATION, "result/run.toml": kinds.SETTINGS,
@@ -81,6 +84,13 @@ def folder(tmp_path_factory: pytest.TempPathFactory, measurement: Any, ball: Any
     VolumeSequence.create(out / "truth.zarr", [0.0, 0.1], grid, ["index_excess"], 1.00027)
     VelocitySequence.begin(out / "velocity.zarr", [0.0, 0.1], grid, [], {})
     SequenceStore.begin(out / "store.zarr", films, grid, ["index_excess"], NetworkShape(width=8, depth=2), {})
+    for store, file in (("films.zarr", "film.nc"), ("truth.zarr", "fields.nc")):
+        with xr.open_zarr(out / store, consolidated=False) as dataset:
+            dataset.to_netcdf(out / file, engine="h5netcdf")
+            if store == "films.zarr":
+                dataset.drop_encoding().to_zarr(out / "old.zarr", zarr_format=2)
+    shutil.make_archive(str(out / "inside"), "zip", out / "films.zarr")
+    shutil.make_archive(str(out / "films.zarr"), "zip", out, "films.zarr")
     for source in ("reference", "flow"):
         (out / "lab" / "cam1" / source).mkdir(parents=True)
         tifffile.imwrite(out / "lab" / "cam1" / source / "1.TIF", np.zeros((9, 12), dtype=np.uint8))
@@ -111,6 +121,24 @@ def test_a_command_names_the_kind_that_it_got(folder, monkeypatch, refusal, comm
             assert line.startswith(f"nerif: {name}: expected "), line
             assert line.endswith(f", got {kind.name}; {use}\n"), line
     assert sorted(folder.rglob("*")) == before
+
+
+@pytest.mark.filterwarnings("ignore:The data type")  # of texts of fixed length, by zarr
+@pytest.mark.parametrize("name", ["film.nc", "old.zarr", "inside.zip", "films.zarr.zip"])
+def test_a_film_in_another_form_is_read_after_the_conversion_that_is_named(folder, tmp_path, monkeypatch, name):
+    use = kind_of(folder / name).use
+    _, option, code, *arguments = shlex.split(use[use.index("python") :].replace("{path}", str(folder / name)))
+    monkeypatch.chdir(tmp_path)
+    if option == "-c":
+        monkeypatch.setattr("sys.argv", ["-c", *arguments])
+        exec(code, {})
+    else:
+        assert [option, code] == ["-m", "zipfile"]
+        zipfile.main(arguments)
+    (store,) = tmp_path.iterdir()
+    ours, expected = MeasurementSequence.read(store), MeasurementSequence.read(folder / "films.zarr")
+    assert ours.times == expected.times
+    assert np.array_equal(ours.frame(0).displacement, expected.frame(0).displacement, equal_nan=True)
 
 
 def test_a_command_to_copy_contains_no_command_of_a_name(folder, tmp_path, monkeypatch):

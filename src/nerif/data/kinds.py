@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import re
+import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -85,6 +86,17 @@ IMAGES = Kind("images", f"put them into FOLDER/VIEW/reference and FOLDER/VIEW/fl
 ARRAYS = Kind(
     "plain arrays", f"of images: {DISPLACEMENT.format('FOLDER')}; of displacements: nerif.Measurement in Python"
 )
+CONVERT = (
+    'python -c "import sys, xarray as x; x.%s(sys.argv[1], decode_times=False).drop_encoding().to_zarr(sys.argv[2], '
+    'zarr_format=3, consolidated=False)" {path} NAME.zarr'
+)
+FILM_FILE = Kind("a film as one NetCDF file", f"make it a store: {CONVERT % 'open_dataset'}")
+FORMAT_2 = Kind(
+    "a store of Zarr format 2",
+    f"if you trust it (its filters can run code), convert it: {CONVERT % 'open_zarr'}",
+)
+ZIPPED = Kind("a zipped store", "unpack it: python -m zipfile -e {path} .")
+ZIPPED_CONTENT = Kind("a zipped store", "unpack it: python -m zipfile -e {path} NAME.zarr")
 CALIBRATION = Kind("a calibration", "nerif displacement FOLDER --calibration {path} -o m.nc uses it")
 VECTORS = Kind(
     "vectors of another program",
@@ -139,6 +151,8 @@ def _of_folder(path: Path) -> Kind | None:
     if (path / "zarr.json").is_file():
         return _of_store(path / "zarr.json")
     names = {entry.name.lower() for entry in path.iterdir()}
+    if names & {".zgroup", ".zmetadata"}:
+        return FORMAT_2
     if names & {RUN, FIELD}:
         return RESULT
     if "views.toml" in names or any(_is_view(entry) for entry in path.iterdir() if entry.is_dir()):
@@ -181,9 +195,16 @@ def _of_file(path: Path) -> Kind | None:
         return CALIBRATION if mark else {"views.toml": VIEWS, RUN: SETTINGS}.get(path.name.lower())
     if suffix in SUFFIXES and suffix not in (*ARRAY_SUFFIXES, *DAVIS):
         return IMAGES
+    if zipfile.is_zipfile(path):
+        with zipfile.ZipFile(path) as archive:
+            heads = [name for name in archive.namelist() if name.endswith(("zarr.json", ".zgroup"))]
+        if heads:
+            return ZIPPED if min(name.count("/") for name in heads) else ZIPPED_CONTENT
     try:
         with opened(path, "a measurement or a volume") as dataset:
             maps = any(kind.measured in dataset for kind in TECHNIQUES.values())
+            if any(variable.dims[:1] == ("time",) and variable.ndim > 2 for variable in dataset.variables.values()):
+                return FILM_FILE
             if maps or known_conventions(dataset.attrs.get("Conventions")):
                 return MEASUREMENT
             if {"x", "y", "z"} <= set(dataset.coords):

@@ -95,8 +95,7 @@ def read_volume(path: str | os.PathLike[str], quantity: str | None = None, gaps:
         quantity = next((q for q in ("index_excess", "n") if q in arrays), only)
     if quantity is None or quantity not in arrays:
         raise InputError(
-            f"expected a variable '{quantity or 'index_excess'}', got {', '.join(arrays) or 'none on z, y, x'}",
-            field=path,
+            f"expected a variable '{quantity or 'index_excess'}', got {', '.join(arrays)}", field=path
         )
     volume = _volume(quantity, arrays[quantity], grid, attributes)
     index = quantity in ("index_excess", "n")
@@ -126,7 +125,10 @@ def read_volumes(path: str | os.PathLike[str]) -> dict[str, Volume]:
 def _read(path: Path) -> Content:
     """Return the content of a file; attributes of one quantity under density.assumption and the like."""
     with reading_as(path, VOLUME):
-        return _read_as_ending(path)
+        content = _read_as_ending(path)
+        if not content[0]:
+            raise InputError("expected a variable 'index_excess', got none on z, y, x", field=path)
+        return content
 
 
 def _read_as_ending(path: Path) -> Content:
