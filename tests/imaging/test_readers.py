@@ -163,7 +163,7 @@ def test_bayer_pattern_of_tiff(tmp_path, stack12, codes, cfa):
     assert open_frames(tmp_path / "grey.tif").cfa is None
 
 
-@pytest.mark.parametrize("suffix", [".png", ".bmp"])
+@pytest.mark.parametrize("suffix", [".png", ".bmp", ".pgm"])
 def test_images_of_8_bit(tmp_path, stack8, suffix):
     write_images(tmp_path / "cam1", stack8, suffix)
     frames = open_frames("cam1", tmp_path)
@@ -181,7 +181,31 @@ def test_png_and_jpeg_by_other_programs(tmp_path, stack8, stack12):
     np.testing.assert_allclose(open_frames(tmp_path / "a.jpg")[0], smooth.astype(float), atol=12)
 
 
-@pytest.mark.parametrize("suffix", [".png", ".bmp", ".tif", "planes.tif"])
+@pytest.mark.parametrize(("top", "bits"), [(255, 8), (1023, 10), (4095, 12), (65535, 16), (4000, 16)])
+def test_pgm_of_all_depths(tmp_path, rng, top, bits):
+    images = rng.integers(0, top, (2, H, W), endpoint=True).astype(np.uint8 if top < 256 else np.uint16)
+    head = f"P5\n# of a camera\n{W} {H}\n{top}\n".encode()
+    for i, image in enumerate(images):
+        (tmp_path / f"{i}.pgm").write_bytes(head + (image if top < 256 else image.astype(">u2")).tobytes())
+    frames = open_frames(tmp_path)
+    same(frames, images)
+    assert frames.bits == bits
+    (tmp_path / "0.pgm").write_text(f"P2 {W} {H} {top}\n" + " ".join(map(str, images[0].ravel())))
+    same(open_frames(tmp_path), images)
+
+
+def test_jpeg_2000_and_webp_and_pcoraw(tmp_path, stack8, stack12):
+    (tmp_path / "jp2").mkdir()
+    for i, image in enumerate(stack12):
+        Image.fromarray(image).save(tmp_path / "jp2" / f"{i}.jp2", irreversible=False)
+    same(open_frames(tmp_path / "jp2"), stack12)
+    Image.fromarray(stack8[0]).save(tmp_path / "a.webp", lossless=True)
+    same(open_frames(tmp_path / "a.webp"), stack8[:1])
+    write_tiff(tmp_path / "film.pcoraw", stack12, photometric="minisblack", bigtiff=True)
+    same(open_frames(tmp_path / "film.pcoraw"), stack12)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".bmp", ".tif", ".ppm", "planes.tif"])
 def test_colours_become_luminance(tmp_path, rng, suffix):
     rgb = rng.integers(0, 256, (H, W, 3)).astype(np.uint8)
     path = tmp_path / f"a{suffix}"
@@ -600,6 +624,10 @@ def test_reference_and_flow_have_one_size_and_depth(tmp_path, stack12, stack8):
         ("films/*.wmv", "films/*.wmv", "got 3 files ending in .wmv; .* TIFF"),
         ("notes.txt", "notes.txt", "'.txt'; export other formats as TIFF"),
         ("arrays/*.npy", "arrays/a.npy", "one recording"),
+        ("flow.seq", "flow.seq", "got a file of Norpix StreamPix: export it there as a sequence of TIFF"),
+        ("fits", "fits", "got 1 file ending in .fits; they are of FITS: open it in ImageJ"),
+        ("fits/*.fits", "fits/*.fits", "they are of FITS: open it in ImageJ"),
+        ("dark.sif", "dark.sif", "got a file of Andor Solis: export it there as TIFF"),
     ],
 )
 def test_missing_files(tmp_path, stack8, spec, field, remedy):
@@ -612,6 +640,10 @@ def test_missing_files(tmp_path, stack8, spec, field, remedy):
     for name in "ab":
         np.save(tmp_path / "arrays" / f"{name}.npy", stack8)
     (tmp_path / "notes.txt").touch()
+    (tmp_path / "flow.seq").touch()
+    (tmp_path / "dark.sif").touch()
+    (tmp_path / "fits").mkdir()
+    (tmp_path / "fits" / "a.fits").touch()
     with pytest.raises(InputError, match=remedy) as error:
         open_frames(spec, tmp_path)
     assert error.value.field == field
@@ -650,7 +682,7 @@ def test_a_part_of_another_file_is_not_read(tmp_path, kind, name, read):
         read(tmp_path / name)
 
 
-@pytest.mark.parametrize("suffix", [".png", ".bmp", ".jpg", ".tif"])
+@pytest.mark.parametrize("suffix", [".png", ".bmp", ".jpg", ".tif", ".pgm", ".jp2", ".webp"])
 @pytest.mark.parametrize("bad", [0, 2])
 def test_truncated_images(tmp_path, rng, suffix, bad):
     write_images(tmp_path / "cam1", rng.integers(0, 256, (N, 40, 50)).astype(np.uint8), suffix)

@@ -65,6 +65,9 @@ def test_folders_are_views_in_natural_order(folder):
     assert [v.name for v in find_views(folder, ["cam10"])] == ["cam10"]
     with refused("view 'cam2'"):
         views[0].open("target")
+    (folder / "cam2" / "target.seq").touch()  # not read, but named
+    with pytest.raises(InputError, match="of Norpix StreamPix: export it"):
+        find_views(folder)[0].open("target")
     with refused("views"):
         find_views(folder, ["cam3"])
     for empty in ("nowhere", "notes"):

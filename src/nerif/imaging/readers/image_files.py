@@ -18,7 +18,7 @@ import numpy as np
 
 from nerif.common.conventions import InputError
 from nerif.common.files import ending
-from nerif.common.image_names import RAW
+from nerif.common.image_names import NETPBM, PILLOW, RAW
 from nerif.common.installation import install
 from nerif.imaging.readers.camera_raw import CameraRaw
 from nerif.imaging.readers.frame_numbers import numbers_in_names
@@ -316,7 +316,7 @@ def _significant_bits(chunks: dict[bytes, bytes]) -> int | None:
 
 
 class Image(ImageFile):
-    """An image that Pillow reads: BMP, JPEG; of others by such a name, EPS would start Ghostscript."""
+    """An image that Pillow reads; of others by such a name, EPS would start Ghostscript."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -324,10 +324,37 @@ class Image(ImageFile):
     def read(self, i: int) -> np.ndarray:
         from PIL import Image as Pillow
 
-        with Pillow.open(self._path, formats=("BMP", "JPEG")) as image:
+        with Pillow.open(self._path, formats=("BMP", "JPEG", "JPEG2000", "WEBP")) as image:
             check_size(image.size, self._path)
             palette = image.palette if image.mode == "P" else None
             return np.array(image if palette is None else image.convert(palette.mode))
+
+
+class Netpbm(ImageFile):
+    """A grey (PGM: P2, P5) or colour (PPM: P3, P6) image of one byte or two, or its numbers as text."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        with path.open("rb") as file:
+            head = NETPBM_HEAD.match(file.read(4096))
+        if head is None:
+            raise ValueError("no PGM or PPM file")
+        kind, width, height, self._top = map(int, head.groups())
+        self._is_text, channels, self._begin = kind < 4, 3 if kind in (3, 6) else 1, head.end()
+        self._shape, self._type = (height, width, channels), ">u2" if self._top > 255 else "u1"
+        check_size(self._shape, path)
+
+    @property
+    def bits(self) -> int | None:  # type: ignore[override]
+        bits = self._top.bit_length()
+        return bits if 8 < bits < 16 and self._top == 2**bits - 1 else None
+
+    def read(self, i: int) -> np.ndarray:
+        data = self._path.read_bytes()[self._begin :]
+        count = math.prod(self._shape)
+        if self._is_text:
+            return np.array(data.split()[:count], dtype=self._type).reshape(self._shape)
+        return np.frombuffer(data, self._type, count).reshape(self._shape)
 
 
 class LaVision(ImageFile):
@@ -364,6 +391,7 @@ def _lvpyio() -> Any:
     return lvpyio
 
 
+NETPBM_HEAD = re.compile(rb"P([2356])" + 3 * rb"(?:\s|#[^\n]*\n)+(\d{1,9})" + rb"\s")
 MOST_CHANNELS = 4
 NO_COMPRESSION, LOWEST_BIT_FIRST = 1, 2  # compression and fill order of TIFF
 MIN_IS_WHITE, PALETTE, CFA = 0, 3, 32803  # photometric interpretations of TIFF
@@ -415,8 +443,8 @@ def _inverted(image: np.ndarray, bits: int) -> np.ndarray:
 
 
 OPENERS: dict[str, type[ImageFile]] = {
-    ".tif": Tiff, ".tiff": Tiff, ".png": Png, ".bmp": Image, ".jpg": Image, ".jpeg": Image,
-    ".im7": LaVision, ".vc7": LaVision, ".b16": B16, **dict.fromkeys(RAW, CameraRaw),
+    ".tif": Tiff, ".tiff": Tiff, ".pcoraw": Tiff, ".png": Png, **dict.fromkeys(PILLOW, Image),
+    **dict.fromkeys(NETPBM, Netpbm), ".im7": LaVision, ".vc7": LaVision, ".b16": B16, **dict.fromkeys(RAW, CameraRaw),
 }  # fmt: skip
 
 

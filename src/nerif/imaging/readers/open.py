@@ -18,7 +18,16 @@ from jaxtyping import Bool
 
 from nerif.common.conventions import InputError
 from nerif.common.files import check_file, ending, local_path
-from nerif.common.image_names import ARRAYS, FOLDER_SUFFIXES, HDF5, PHOTRON, SINGLE_SUFFIXES, SUFFIXES, VIDEO
+from nerif.common.image_names import (
+    ARRAYS,
+    EXPORTS,
+    FOLDER_SUFFIXES,
+    HDF5,
+    PHOTRON,
+    SINGLE_SUFFIXES,
+    SUFFIXES,
+    VIDEO,
+)
 from nerif.imaging.readers.array_files import ArrayFrames, Hdf5Frames
 from nerif.imaging.readers.binning import binned_mask
 from nerif.imaging.readers.cine import CineFrames
@@ -109,7 +118,8 @@ def _open_files(files: list[Path], names: list[str], dataset: str = "") -> Frame
     for path, name in zip(files, names, strict=True):
         check_file(path)
         if ending(path) not in SUFFIXES:
-            raise InputError(f"expected one of {READ}, got '{path.suffix}'; {EXPORT}", field=name)
+            remedy = f"a file {EXPORTS[ending(path)]}" if ending(path) in EXPORTS else f"'{path.suffix}'; {EXPORT}"
+            raise InputError(f"expected one of {READ}, got {remedy}", field=name)
         if len(files) > 1 and ending(path) in SINGLE_SUFFIXES:
             raise InputError(f"one of {len(files)} files of a pattern; name one recording at a time", field=name)
     suffix = ending(files[0])
@@ -169,6 +179,8 @@ def _content(paths: list[Path], base: Path | None) -> str:
     text = f"{', '.join(content) or 'none'}; "
     if single := sorted(p for p in paths if ending(p) in SUFFIXES):
         return text + f"name one file, such as '{_label(single[0], base)}'"
+    if foreign := next((EXPORTS[ending(p)] for p in paths if ending(p) in EXPORTS), ""):
+        return f"{text}they are {foreign}"
     return text + "is it the right folder?" + (f" Images end in {READ}; {EXPORT}" if endings else "")
 
 

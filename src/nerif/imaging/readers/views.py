@@ -36,7 +36,7 @@ from jaxtyping import Bool
 
 from nerif.common.conventions import InputError, check_name
 from nerif.common.files import check_known, ending, local_path, read_toml, write_toml
-from nerif.common.image_names import SOURCES, SUFFIXES
+from nerif.common.image_names import EXPORTS, SOURCES, SUFFIXES
 from nerif.data.kinds import EXPERIMENT, reading_as
 from nerif.imaging.readers.binning import bin_mosaics
 from nerif.imaging.readers.crop import Crop
@@ -55,8 +55,8 @@ TOGETHER = (("target", "background"), ("reference", "flow"))
 """Images that are compared: if one of the two is binned, so is the other."""
 
 CROP = tuple(f.name for f in fields(Crop))
-HEADS = tuple(suffix for suffix in SUFFIXES if suffix != ".mraw")
-"""Endings of files of images; the .mraw of a Photron recording stands beside its header."""
+HEADS = (*(suffix for suffix in SUFFIXES if suffix != ".mraw"), *EXPORTS)
+"""Endings of files of images, also of those that are refused; the .mraw of Photron stands beside its header."""
 VIEWS = "views.toml"
 OFFSET = "frame_offset"
 """Name of a view's frame offset in views.toml, on the command line and in stores."""
