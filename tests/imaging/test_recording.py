@@ -222,12 +222,12 @@ def test_a_film_of_dropped_frames_has_the_images_of_each_instant(recording, tmp_
     assert film.frame(2).names == ("0deg",)
     assert torch.equal(film.frame(3).displacement[1].nan_to_num(), plain[0])
     assert not torch.equal(plain[0], plain[1])
-    assert any("frame 2: left out: view '60deg': no flow image of number 2" in line for line in lines)
+    assert any("frame 2: left out: view '60deg': no flow image of instant 2" in line for line in lines)
     assert film.frame(0).frame_offsets == {"60deg": 1}
     lines.clear()
     mean, _ = measure_instant(dropping, range(1, 4), lines.append)
     assert mean.names == ("0deg", "60deg")
-    assert sum("no flow image of number" in line for line in lines) == 3
+    assert sum("no flow image of instant" in line for line in lines) == 3
 
 
 def test_frames_missing_in_the_times_of_a_film_are_gaps(tmp_path):

@@ -226,7 +226,7 @@ class ViewReference:
         cause, name = "", f"view '{self.view.name}'"
         for i in numbers:
             if len(numbers) > 1 and i not in self.view.instants:
-                cause = f"no flow image of number {i}"
+                cause = f"no flow image of instant {i}"
                 say(f"left out: view '{self.view.name}': {cause}")
                 continue
             image, name = self.view.flow_image(i)

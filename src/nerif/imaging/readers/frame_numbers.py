@@ -14,7 +14,7 @@ from jaxtyping import Int
 
 from nerif.common.conventions import InputError
 
-__all__ = ["Count", "common_count", "natural_order", "numbers_in_names", "numbers_in_words", "words_of_names"]
+__all__ = ["Count", "common_count", "natural_order", "numbers_in_names", "words_of_names"]
 
 Numbers = Int[np.ndarray, "frame"]
 
@@ -145,10 +145,10 @@ def common_count(
         missing = every[(every > present[0]) & (every < present[-1]) & ~np.isin(every, present)]
         if len(missing):
             of_names = (missing - present[0]) * step + numbers[name][0]
-            lines.append(f"view '{name}' has no flow image {numbers_in_words(of_names, step)}; did its camera drop it?")
+            lines.append(f"view '{name}' has no flow image {_in_words(of_names, step)}; did its camera drop it?")
     gaps = np.setdiff1d(np.arange(every[0], every[-1]), every)
     if len(gaps):
-        lines.append(f"no view has flow image {numbers_in_words(gaps * step + first, step)}: a gap in time")
+        lines.append(f"no view has flow image {_in_words(gaps * step + first, step)}: a gap in time")
     return Count(first, step, offsets, in_order, tuple(lines))
 
 
@@ -189,8 +189,8 @@ def _from_first(
     return offsets
 
 
-def numbers_in_words(numbers: Sequence[int] | Numbers, step: int = 1) -> str:
-    """Return numbers as ranges, such as 3, 5 to 9."""
+def _in_words(numbers: Numbers, step: int) -> str:
+    """Numbers as ranges, such as 3, 5 to 9."""
     ranges: list[list[int]] = []
     for n in map(int, numbers):
         if ranges and n == ranges[-1][1] + step:

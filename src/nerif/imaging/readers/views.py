@@ -162,7 +162,7 @@ class View:
         """Return the flow image of an instant, cropped, and its name."""
         frames = self.open("flow")
         if instant not in self._places:
-            raise InputError(f"no flow image of number {instant}: a gap in {self.sources['flow']}")
+            raise InputError(f"no flow image of instant {instant}: a gap in {self.sources['flow']}")
         i = self._places[instant]
         return self.cropped(frames[i], frames.name(i)), frames.name(i)
 
@@ -217,22 +217,20 @@ class View:
 def paired(views: Sequence[View]) -> tuple[View, ...]:
     """Return the views with their flow images counted in common; those that cannot be opened stay as they are."""
     numbers: dict[str, np.ndarray] = {}
-    lengths: dict[str, int] = {}
+    in_order = False
     for view in views:
         try:
             frames = view.open("flow")
         except InputError:  # reported where they are read
             continue
-        lengths[view.name] = len(frames)
-        if frames.numbers is not None:
-            numbers[view.name] = frames.numbers
-    places = {name: numbers.get(name, np.arange(length)) for name, length in lengths.items()}
-    if not places:
+        in_order |= frames.numbers is None
+        numbers[view.name] = np.arange(len(frames)) if frames.numbers is None else frames.numbers
+    if not numbers:
         return tuple(views)
-    count = common_count(places, {view.name: view.frame_offset for view in views}, len(numbers) < len(lengths))
+    count = common_count(numbers, {view.name: view.frame_offset for view in views}, in_order)
     result = []
     for view in views:
-        result.append(replace(view, count=count) if view.name in lengths else view)
+        result.append(replace(view, count=count) if view.name in numbers else view)
         result[-1]._opened.update(view._opened)
     return tuple(result)
 
