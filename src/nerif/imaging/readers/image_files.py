@@ -67,7 +67,7 @@ class FileFrames(Frames):
         return len(self._places)
 
     @cached_property
-    def numbers(self) -> np.ndarray | None:  # type: ignore[override]
+    def numbers(self) -> np.ndarray | None:
         counts, size = np.array(self._counts), self._counts[0]
         of_files = numbers_in_names(self._names) if len(counts) > 1 else np.zeros(1, np.int64)
         if of_files is None or (counts[:-1] != size).any() or counts[-1] > size:
