@@ -9,8 +9,9 @@ import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from nerif.imaging.displacement.correlation import normalised_median_outliers, window_correlation
-from nerif.imaging.displacement.displacement import DisplacementSettings, border, displacement, measure, remove_shake
+from nerif.imaging.displacement.displacement import UNEVEN, DisplacementSettings, displacement, measure
 from nerif.imaging.displacement.optical_flow import FLOWS
+from nerif.imaging.displacement.shake import border, remove_shake
 from nerif.imaging.displacement.warping import warp
 from nerif.imaging.patterns import Background
 from refusals import refused
@@ -138,6 +139,65 @@ def test_shake_is_removed(pattern, truth):
     assert median_error(plain.displacement, truth, inner) > 0.5
     assert median_error(still.displacement, truth, inner) < 0.05
     assert still.valid.mean() > 0.9
+
+
+@pytest.mark.parametrize("width", [0, 20])
+@pytest.mark.parametrize("movement", [(14.3, -3.0, 0.0), (-6.0, 21.0, 0.0), (11.0, 8.0, 0.02)])
+def test_a_camera_that_moved_far_is_found_first(pattern, truth, movement, width):
+    u, v, roll = movement
+    shake = np.stack([u - roll * (ROWS - 45), v + roll * (COLUMNS - 60)], axis=-1)
+    references, flow = images(pattern, truth + shake)
+    result = measure(references, [flow], DisplacementSettings(shake_border=width))
+    error = np.linalg.norm(result.displacement - (truth if width else truth + shake), axis=-1)
+    row, column = ROWS - shake[..., 1], COLUMNS - shake[..., 0]
+    seen = (row > 8) & (row < SHAPE[0] - 8) & (column > 8) & (column < SHAPE[1] - 8)
+    assert result.valid[seen].mean() > 0.95
+    assert np.sqrt(np.mean(error[result.valid] ** 2)) < 0.1
+    assert np.allclose(result.shift, (u, v), atol=1.5)
+    assert not result.valid[(row < -1) | (column < -1) | (row > SHAPE[0]) | (column > SHAPE[1])].any()
+    if width:  # a fit to the images has no data where the reference ends
+        assert np.isnan(result.pair.flow[(row < -2) | (column < -2)]).all()
+
+
+PEAKS = [("correlation", 12.0, 30.0, 0.99), ("correlation", 16.0, 34.0, 0.9), ("correlation", 25.0, 50.0, 0.9),
+         ("correlation", 20.0, 22.0, 0.0), ("dis", 16.0, 34.0, 0.85)]  # fmt: skip
+
+
+@pytest.mark.parametrize(("method", "largest", "radius", "share"), PEAKS)
+def test_displacements_larger_than_the_window_are_right_or_not_valid(method, largest, radius, share):
+    shape = (180, 200)
+    rows, columns = np.mgrid[: shape[0], : shape[1]].astype(float)
+    fine = gaussian_filter(Background("dots", 280.0, 260.0, dot=3.0, seed=2).raster(0.5), 1.0)
+    bump = largest * np.exp(-((rows - 85) ** 2 + (columns - 104) ** 2) / radius**2)
+    d = np.stack([0.8 * bump, -0.6 * bump], axis=-1)
+
+    def exposed(y, x, seed):
+        grey = 3000 * map_coordinates(fine, [2 * y + 80.5, 2 * x + 80.5], order=3, mode="reflect")
+        return grey + 12 * np.random.default_rng(seed).standard_normal(shape)
+
+    reference, flow = exposed(rows, columns, 0), exposed(rows - d[..., 1], columns - d[..., 0], 1)
+    result = measure([reference], [flow], DisplacementSettings(method))
+    error = np.abs(result.displacement - d)[INNER]
+    valid, core = result.valid[INNER], (bump > 0.5 * largest)[INNER]
+    assert valid.mean() > 0.8
+    assert valid[core].mean() >= share
+    assert (error > 3 * result.sigma[INNER]).any(axis=-1)[valid].mean() < 0.01
+    assert error[valid].max() < 1.0
+    if not share:
+        assert result.losses[UNEVEN] > 0.01
+
+
+@pytest.mark.parametrize(("jump", "width"), [(2.0, 1.0), (4.0, 3.0), (1.0, 2.0)])
+def test_sigma_grows_at_fronts(pattern, jump, width):
+    across = COLUMNS - 0.2 * ROWS - 50
+    d = np.stack([jump * (np.clip(across / width + 0.5, 0, 1) - 0.5), 0 * across], axis=-1)
+    references, flow = images(pattern, d)
+    result = measure(references, [flow], DisplacementSettings())
+    front, away = np.abs(across[INNER]) < 8, np.abs(across[INNER]) > 25
+    error, sigma = np.abs(result.displacement - d)[INNER][..., 0], result.sigma[INNER][..., 0]
+    valid = result.valid[INNER]
+    assert (error > 3 * sigma)[front & valid].mean() < 0.05
+    assert np.median(sigma[front]) > 4 * np.median(sigma[away])
 
 
 def test_shake_ignores_outliers_and_leaves_a_still_image_unchanged():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 import tifffile
@@ -124,3 +126,17 @@ def test_a_background_that_repeats_is_reported_and_lines_are_refused(tmp_path):
     assert any(f"'{A}': displacements reach 5." in line and "from 6.0 px on, half the period" in line for line in notes)
     (left,) = (line for line in notes if f"view '{B}' left out" in line)
     assert "has lines along y, and no shift along them can be measured" in left
+
+
+@pytest.mark.parametrize("width", [0, 20])
+def test_a_camera_that_moved_is_reported_with_its_shift(tmp_path, width):
+    scenes = {f"{A}/flow": [np.roll(dots(0), (9, -14), (0, 1))] * 2}
+    recorded, lines = recording(tmp_path, scenes), []
+    recorded = dataclasses.replace(recorded, method=DisplacementSettings("dis", shake_border=width))
+    measurement, _ = measure_instant(recorded, say=lines.append)
+    (line,) = (line for line in lines if "moved" in line)
+    assert f"view '{A}': the whole image moved by about (-14, 9) px between reference and flow" in line
+    assert ("--shake-border 20 removes it" if width else "give --shake-border N") in line
+    expected = [0, 0] if width else [-14, 9]
+    assert measurement.displacement[0][30:80, 30:100].mean(dim=(0, 1)).tolist() == pytest.approx(expected, abs=0.05)
+    assert bool(measurement.valid[0][30:80, 30:100].all())

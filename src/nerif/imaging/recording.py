@@ -19,7 +19,13 @@ from nerif.common.settings import check_settings
 from nerif.data.measurement import Measurement
 from nerif.geometry import Box, Camera
 from nerif.imaging.calibration.cameras_file import CalibratedCamera
-from nerif.imaging.displacement.displacement import OVEREXPOSED, DisplacementMap, DisplacementSettings, Reference
+from nerif.imaging.displacement.displacement import (
+    OVEREXPOSED,
+    UNEVEN,
+    DisplacementMap,
+    DisplacementSettings,
+    Reference,
+)
 from nerif.imaging.displacement.repetition import Repetition, repetition
 from nerif.imaging.masks import MaskSettings, flow_mask
 from nerif.imaging.readers.exposure import check_exposure
@@ -33,6 +39,7 @@ __all__ = ["Recording", "Scene", "Surroundings", "ViewReference", "camera_of", "
 PixelMask = Bool[np.ndarray, "row column"]
 
 AMBIGUOUS = 0.4, 0.005  # part of a period, and share of the pixels displaced by more
+NOTABLE = 0.005  # share of pixels that move too unevenly, from which on it is reported
 FEW = 0.5  # share of valid pixels below which their number is reported
 WORTH_PROCESSES = 2**22  # pixels of all images together
 
@@ -240,6 +247,7 @@ class ViewReference:
             raise InputError(f"none of the {len(numbers)} flow images can be used; {cause}", field=name)
         result = self.reference.measure(list(images.values()), self.region, self.images)
         self._check_share(result, images, say)
+        self._report_movements(result, say)
         self._check_period(result, say)
         mask = self.drawn_mask
         if mask is None and self.masks is not None:
@@ -266,6 +274,22 @@ class ViewReference:
             text = f"no valid pixel ({result.loss_text}); do the images show one pattern, in focus?"
             raise InputError(text, field=next(iter(images)))
         say(f"note: view '{self.view.name}': {100 * share:.0f} % of its pixels are valid; {result.loss_text}")
+
+    def _report_movements(self, result: DisplacementMap, say: Callable[[str], None]) -> None:
+        """Report a shift of the whole image, and displacements that change too much within a window."""
+        settings, name = self.reference.settings, f"note: view '{self.view.name}':"
+        if any(result.shift):
+            u, v = result.shift
+            remedy = "give --shake-border N, the width of a border without flow, to remove it"
+            remedy = f"--shake-border {settings.shake_border} removes it" if settings.shake_border else remedy
+            say(f"{name} the whole image moved by about ({u}, {v}) px between reference and flow; {remedy}")
+        if (share := result.losses[UNEVEN]) > NOTABLE:
+            largest = np.quantile(np.linalg.norm(result.displacement[result.valid], axis=-1), 1 - NOTABLE)
+            say(
+                f"{name} {100 * share:.1f} % of its pixels are {UNEVEN} to be measured: from the reference to the flow "
+                f"image and back, d differs by over {settings.max_sigma:g} px (valid ones reach {largest:.0f} px). "
+                "Print larger dots, bring the background nearer to the flow, or try smaller windows (--smoothness 0.7)"
+            )
 
     def _check_period(self, result: DisplacementMap, say: Callable[[str], None]) -> None:
         """Report displacements that a repeating background makes ambiguous."""

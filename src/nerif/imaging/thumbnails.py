@@ -9,11 +9,14 @@ import numpy as np
 from jaxtyping import Complex, Float, Shaped
 
 from nerif.common.conventions import InputError
-from nerif.imaging.displacement.displacement import remove_shake
+from nerif.imaging.displacement.noise import local_correlation
+from nerif.imaging.displacement.shake import remove_shake
 from nerif.imaging.readers.frames import as_float
 from nerif.imaging.readers.views import View, read_sample
 
-__all__ = ["Thumbnail", "binned", "local_displacement", "match", "parabola", "related", "shifted", "thumbnails"]
+__all__ = [
+    "Thumbnail", "binned", "common_shift", "local_displacement", "match", "parabola", "related", "shifted", "thumbnails",
+]  # fmt: skip
 
 LONGEST = 256  # px of the longer side
 COARSE = 6.0  # px, standard deviation of the mean that is subtracted: vignettes and lamps are alike in all scenes
@@ -23,6 +26,7 @@ CLIP = 4.0  # standard deviations; an edge or a reflection does not outweigh the
 TILE = 16  # px
 MIN_PIXELS = 10_000  # of an image; in smaller ones, half hidden and noisy, one scene correlates no more than chance
 HIGH = 0.3  # correlation that no two scenes have
+LARGE = 0.2  # share of the image that has to move as a whole
 SIGNIFICANT = 8.0  # standard deviations over all shifts; the highest peak of two scenes has five
 
 
@@ -103,6 +107,15 @@ def match(first: Thumbnail, second: Thumbnail) -> tuple[float, Float[np.ndarray,
     x = column + parabola(surface[row, column - 1], peak, surface[row, (column + 1) % shape[1]])[0]
     wrapped = [(v + n / 2) % n - n / 2 for v, n in ((x, shape[1]), (y, shape[0]))]
     return peak, np.array(wrapped) * first.binning
+
+
+def common_shift(first: Thumbnail, second: Thumbnail) -> Float[np.ndarray, " 2"]:
+    """Return the shift (x, y) of the second image as a whole, px; 0 if more of it correlates without a shift."""
+    shift = match(first, second)[1]
+    still, moved = (
+        float(np.mean(local_correlation(shifted(first, s), second.detail, TILE / 2) > HIGH)) for s in (0 * shift, shift)
+    )
+    return shift if moved > max(still, LARGE) else np.zeros(2)
 
 
 def parabola(before: float, top: float, after: float) -> tuple[float, float]:

@@ -4,6 +4,9 @@ Each window of the first array is correlated with the same window of the second,
 is fitted by a Gaussian through three points per direction; outliers are replaced. Arrays are indexed (row, column) or
 (z, y, x), movements have components (u, v) or (x, y, z).
 
+A window that moves unevenly has a correlation peak only if the movement differs by less than a dot across it. Images
+therefore begin binned, where dots are larger: peaks of 25 px come out as well as those of 2 px.
+
 Sources: Scarano, Iterative image deformation methods in PIV, Meas. Sci. Technol. 13 (2002) R1; Westerweel & Scarano,
 Universal outlier detection for PIV data, Exp. Fluids 39 (2005) 1096. No library has it under a compatible licence.
 """
@@ -18,10 +21,13 @@ import numpy as np
 from nerif.common.conventions import InputError
 from nerif.imaging.displacement.warping import warp
 from nerif.imaging.readers.frames import as_float
+from nerif.imaging.thumbnails import binned
 
 __all__ = ["Vectors", "correlate", "normalised_median_outliers", "window_correlation"]
 
 MIN_VARIANCE = 1e-4  # of a window, relative to the mean
+BINNINGS = 8, 4, 2  # before the images themselves
+SMOOTH, COARSE = 0.7, 6.0  # px, standard deviations of the means between which the detail of a binned image lies
 MIN_PEAK = 0.1  # of the correlation, which is 1 where both windows are equal
 
 
@@ -41,32 +47,57 @@ class Vectors:
     valid: np.ndarray
 
 
-def window_correlation(flow: np.ndarray, reference: np.ndarray, window: int = 16, passes: int = 4) -> np.ndarray:
+def window_correlation(flow: np.ndarray, reference: np.ndarray, window: int = 16) -> np.ndarray:
     """Return the movement w (row, column, 2) in px of every pixel from the flow image to the reference.
 
     Parameters
     ----------
     flow, reference : (row, column) grey images of one scale
-    window : edge of the interrogation windows of the last passes, px; the first uses twice that
-    passes : number of passes; windows overlap by three quarters
+    window : edge of the interrogation windows, px; they overlap by three quarters
     """
     if min(flow.shape) < 2 * window:
         raise InputError(
             f"expected at most half the image ({min(flow.shape) // 2} px), got {window} px", field="window"
         )
-    return _interpolated(correlate(flow, reference, window, passes), flow.shape)
+    vectors = None
+    for binning in (b for b in BINNINGS if min(flow.shape) >= 2 * window * b):
+        a, b = _detail(flow, binning), _detail(reference, binning)
+        start = np.zeros((*a.shape, 2)) if vectors is None else _interpolated(vectors, a.shape, binning) / binning
+        coarse = correlate(a, b, window, 2, start=start)
+        centres = tuple(binning * c + (binning - 1) / 2 for c in coarse.axes)
+        vectors = Vectors(centres, binning * coarse.movement, coarse.valid)
+    if vectors is None:
+        return _interpolated(correlate(flow, reference, window), flow.shape)
+    vectors = correlate(flow, reference, window, 3, start=_interpolated(vectors, flow.shape))
+    return _interpolated(vectors, flow.shape)
 
 
-def correlate(first: np.ndarray, second: np.ndarray, window: int, passes: int = 4, central: bool = False) -> Vectors:
+def _detail(image: np.ndarray, binning: int) -> np.ndarray:
+    """The binned image without its uneven light."""
+    from scipy.ndimage import gaussian_filter
+
+    small = binned(image, binning)
+    return np.asarray(gaussian_filter(small, SMOOTH) - gaussian_filter(small, COARSE))
+
+
+def correlate(
+    first: np.ndarray,
+    second: np.ndarray,
+    window: int,
+    passes: int = 4,
+    central: bool = False,
+    start: np.ndarray | None = None,
+) -> Vectors:
     """Return the movement from the first array to the second at the centres of windows.
 
     Parameters
     ----------
     first, second : images or volumes of one shape and scale
-    window : edge of the windows of the last passes, px; the first uses twice that where four of them fit
+    window : edge of the windows, px; without a start the first pass uses twice that where four of them fit
     passes : number of passes; windows overlap by three quarters
     central : whether both arrays are warped by half, so that a vector belongs to the middle of its path; else it
         belongs to the position in the first array
+    start : (*shape, d) movement from which the first pass goes on, px; None for 0
     """
     if first.shape != second.shape:
         raise InputError(f"expected the shape of the first, {first.shape}, got {second.shape}", field="second")
@@ -74,9 +105,9 @@ def correlate(first: np.ndarray, second: np.ndarray, window: int, passes: int = 
         raise InputError(f"expected between 4 and the shortest edge, {min(first.shape)}, got {window}", field="window")
     if passes < 1:
         raise InputError(f"expected at least 1, got {passes}", field="passes")
-    movement = np.zeros((*first.shape, first.ndim), dtype=np.float32)
+    movement = np.zeros((*first.shape, first.ndim), dtype=np.float32) if start is None else start
     for i in range(passes):
-        size = 2 * window if i == 0 and min(first.shape) >= 4 * window else window
+        size = 2 * window if i == 0 and start is None and min(first.shape) >= 4 * window else window
         starts = [_starts(n, size, max(2, size // 4)) for n in first.shape]
         a = warp(first, -movement / 2) if central else first
         b = warp(second, movement / 2 if central else movement)
@@ -197,8 +228,8 @@ def _at(movement: np.ndarray, axes: tuple[np.ndarray, ...]) -> np.ndarray:
     return np.stack(parts, axis=-1)
 
 
-def _interpolated(vectors: Vectors, shape: tuple[int, ...]) -> np.ndarray:
-    """The movement (*shape, d) by cubic splines through the vectors, constant beyond the outer ones."""
+def _interpolated(vectors: Vectors, shape: tuple[int, ...], binning: int = 1) -> np.ndarray:
+    """The movement (*shape, d) of pixels, or bins of them, by cubic splines, constant beyond the outer vectors."""
     from scipy.interpolate import make_interp_spline
 
     movement = vectors.movement
@@ -206,6 +237,6 @@ def _interpolated(vectors: Vectors, shape: tuple[int, ...]) -> np.ndarray:
         if len(centres) == 1:
             movement = movement.repeat(n, axis=axis)
             continue
-        positions = np.clip(np.arange(n), centres[0], centres[-1])
+        positions = np.clip(binning * np.arange(n) + (binning - 1) / 2, centres[0], centres[-1])
         movement = make_interp_spline(centres, movement, min(3, len(centres) - 1), axis=axis)(positions)
     return np.asarray(movement, dtype=np.float32)

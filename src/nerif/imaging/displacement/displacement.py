@@ -7,6 +7,8 @@ the warped reference, the sum is over a Gaussian window of the method's reach. T
 with three or more reference frames, from the scatter of flow-off repeats plus the excess of cov with flow over cov
 without: repeats contain the noise of the camera, but not the error where the flow is too sharp for the method. The
 smoothing error of a window of that reach, applied to d, is added to both.
+
+Where pixels move far, d is measured from the reference to the flow image as well, and the difference is added.
 """
 
 from __future__ import annotations
@@ -24,13 +26,14 @@ from nerif.common.settings import Positive, check_settings
 from nerif.imaging.displacement.noise import FLOOR, local_correlation, smoothing_error, structure_variance
 from nerif.imaging.displacement.optical_flow import FLOWS
 from nerif.imaging.displacement.photometry import CameraNoise, ImagePair
+from nerif.imaging.displacement.shake import border, remove_shake
 from nerif.imaging.displacement.warping import warp
 from nerif.imaging.readers.exposure import saturated
 from nerif.imaging.readers.frames import as_float
+from nerif.imaging.thumbnails import Thumbnail, common_shift
 
 __all__ = [
-    "OVEREXPOSED", "DisplacementMap", "DisplacementSettings", "Reference", "border", "displacement", "measure",
-    "remove_shake",
+    "OVEREXPOSED", "DisplacementMap", "DisplacementSettings", "Reference", "displacement", "measure",
 ]  # fmt: skip
 
 Grey = Shaped[np.ndarray, "row column"]
@@ -40,7 +43,9 @@ PixelMask = Bool[np.ndarray, "row column"]
 REACH = {"deepflow": 1.5, "dis": 1.5, "tvl1": 1.3, "ilk": 1.6, "correlation": 1.8}
 """Standard deviation (px) of the averaging window of each method at smoothness 1 (benchmarks/displacement.py)."""
 
-OVEREXPOSED = "over-exposed"  # cause of loss
+OVEREXPOSED, UNEVEN = "over-exposed", "displaced too unevenly"  # causes of loss
+FAR = 5.0  # px beyond the shift of the whole image; from here on d is measured in both directions
+SHIFTED = 4.0  # px, shift of the whole image that is looked for before displacements
 MAX_REPEATS = 12  # reference frames that are compared with the mean of the others,
 MEGAPIXEL = 2**20  # in images up to this number of pixels
 
@@ -83,6 +88,7 @@ class DisplacementMap:
     noise_source : "repeats" (of the reference, and residual) or "structure tensor"
     pair : the images; None for the mean of several
     losses : shares of the region's pixels that are not valid, by cause, the largest first
+    shift : of the whole image (u, v) between reference and flow, px; 0 below SHIFTED
     """
 
     displacement: Vectors
@@ -91,6 +97,7 @@ class DisplacementMap:
     noise_source: str
     pair: ImagePair | None = None
     losses: Mapping[str, float] = field(default_factory=dict)
+    shift: tuple[int, int] = (0, 0)
 
     @property
     def loss_text(self) -> str:
@@ -100,13 +107,27 @@ class DisplacementMap:
 
 def displacement(reference: Grey, flow: Grey, settings: DisplacementSettings) -> Vectors:
     """Return d (px) of one flow image against one reference, both of any scale and type."""
+    return _displacement_and_shift(reference, flow, settings)[0]
+
+
+def _displacement_and_shift(
+    reference: Grey, flow: Grey, settings: DisplacementSettings
+) -> tuple[Vectors, tuple[int, int]]:
+    """The displacement, and the shift (u, v) of the whole image from which it was measured on, px."""
     if reference.shape != flow.shape or min(flow.shape) < 16:
         raise InputError(
             f"expected reference and flow of one size, at least 16 px, got {reference.shape} and {flow.shape}",
             field="images",
         )
     first, second = _equalised(as_float(flow), as_float(reference), settings.local_contrast)
-    return -FLOWS[settings.method](first, second, settings.smoothness).astype(np.float32)
+    u, v = common_shift(Thumbnail.of(second), Thumbnail.of(first)).round().astype(int).tolist()
+    if np.hypot(u, v) < SHIFTED:
+        u, v = 0, 0
+    else:
+        rows, columns = (np.clip(np.arange(n) - s, 0, n - 1) for n, s in zip(second.shape, (v, u), strict=True))
+        second = second[np.ix_(rows, columns)]
+    movement = FLOWS[settings.method](first, second, settings.smoothness)
+    return ((u, v) - movement).astype(np.float32), (u, v)
 
 
 @dataclass(frozen=True)
@@ -162,34 +183,36 @@ class Reference:
         """
         settings, reach = self.settings, self.settings.reach
         overexposed = self.overexposed.copy()
-        shake = np.zeros(1)
+        shake, shift = np.zeros(1), (0, 0)
 
-        def maps(image: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-            nonlocal overexposed, shake
+        def maps(image: np.ndarray) -> tuple[np.ndarray, ...]:
+            nonlocal overexposed, shake, shift
             grey = np.asarray(image, dtype=np.float32)
-            total = displacement(self.mean, grey, settings)
+            total, shift = _displacement_and_shift(self.mean, grey, settings)
             overexposed |= saturated(image, self.full_scale)
             pair = _equalised(grey, warp(self.mean, -total), 0)
-            d = _without_shake(total, settings)
+            agreement = local_correlation(*pair, max(3.0, reach))
+            d = _without_shake(total, settings, _shown(total) & (agreement >= settings.min_correlation))
             shake = total - d
-            return d, local_correlation(*pair, max(3.0, reach)), structure_variance(*pair, reach)
+            difference = self._difference(grey, total, shift, agreement)
+            return d, total, agreement, structure_variance(*pair, reach), difference
 
-        d, agreement, variance = _means(map(maps, flow))
+        d, total, agreement, variance, difference = _means(map(maps, flow))
         sigma, source = np.sqrt(variance / len(flow)) + FLOOR, "structure tensor"
         if self.noise is not None:
             scatter, without_flow = self.noise
             sigma, source = np.sqrt(scatter**2 + np.maximum(sigma**2 - without_flow**2, 0)), "repeats"
-        sigma = np.sqrt(sigma**2 + smoothing_error(d, reach) ** 2).astype(np.float32)
-        height, width = d.shape[:2]
-        row, column = np.arange(height)[:, None] - d[..., 1], np.arange(width) - d[..., 0]
+        sigma = np.sqrt(sigma**2 + smoothing_error(d, reach) ** 2 + difference / 2).astype(np.float32)
+        shown = _shown(total)
         exposed = ~_dilated(overexposed, 2)
         conditions = {
             OVEREXPOSED: exposed,
-            "outside the reference": (row >= 0) & (row <= height - 1) & (column >= 0) & (column <= width - 1),
+            "outside the reference": shown,
             "uncorrelated": agreement >= settings.min_correlation,
+            UNEVEN: difference.sum(-1) <= settings.max_sigma**2,
             f"with noise above {settings.max_sigma:g} px": sigma.max(-1) <= settings.max_sigma,
         }
-        inside = np.ones((height, width), dtype=bool) if region is None else region
+        inside = np.ones(shown.shape, dtype=bool) if region is None else region
         usable, valid, losses = inside & exposed, inside, {}
         for cause, condition in conditions.items():  # a pixel counts for the first cause
             losses[cause] = float((valid & ~condition).sum() / max(int(inside.sum()), 1))
@@ -197,10 +220,23 @@ class Reference:
         losses = dict(sorted(losses.items(), key=lambda item: -item[1]))
         pair = None
         if keep_images and len(flow) == 1 and bool(valid.any()):
-            reference = warp(self.mean, -shake) if settings.shake_border else self.mean
+            reference = self.mean
+            if settings.shake_border:
+                reference, usable = warp(reference, -shake), usable & _shown(shake, 1.0)
             grey = np.asarray(flow[0], dtype=np.float32)
             pair = ImagePair.of(reference, grey, d, self.camera_noise, self.count, usable, valid)
-        return DisplacementMap(d, sigma, valid, source, pair, losses)
+        return DisplacementMap(d, sigma, valid, source, pair, losses, shift)
+
+    def _difference(self, flow: Image, d: Vectors, shift: tuple[int, int], agreement: Image) -> Vectors:
+        """Local mean square of the difference of d from reference to flow image and back, px^2; 0 if none moves far."""
+        from scipy.ndimage import gaussian_filter
+
+        far = np.linalg.norm(d - np.array(shift), axis=-1) > FAR
+        if not np.any(far & (agreement >= self.settings.min_correlation)):
+            return np.zeros_like(d)
+        back = displacement(flow, self.mean, self.settings)
+        parts = [warp(back[..., k], -d) + d[..., k] for k in range(2)]
+        return np.stack([gaussian_filter(part**2, self.settings.reach) for part in parts], axis=-1)
 
 
 def measure(
@@ -234,43 +270,16 @@ def _means(samples: Iterator[tuple[np.ndarray, ...]]) -> tuple[np.ndarray, ...]:
     return tuple(a / count for a in sums)
 
 
-def _without_shake(d: Vectors, settings: DisplacementSettings) -> Vectors:
-    return remove_shake(d, border(d.shape[:2], settings.shake_border)) if settings.shake_border else d
+def _shown(d: Vectors, margin: float = 0.0) -> PixelMask:
+    """Whether the reference, extended by a margin (px), shows what a pixel of the flow image shows."""
+    height, width = d.shape[:2]
+    row, column = np.arange(height)[:, None] - d[..., 1], np.arange(width) - d[..., 0]
+    inside = (row >= -margin) & (row <= height - 1 + margin) & (column >= -margin) & (column <= width - 1 + margin)
+    return np.asarray(inside)
 
 
-def remove_shake(d: Vectors, still: PixelMask) -> Vectors:
-    """Subtract the similarity d = t + [[a, -b], [b, a]] p that fits best where nothing flows.
-
-    Parameters
-    ----------
-    d : px
-    still : pixels without flow, fitted with Cauchy's loss, robust to outliers
-    """
-    if still.sum() < 8:
-        raise InputError(
-            f"expected at least 8 pixels without flow, got {int(still.sum())}; widen the border", field="shake"
-        )
-    from scipy.optimize import least_squares
-
-    rows, columns = np.mgrid[: d.shape[0], : d.shape[1]].astype(np.float64)
-    scale = max(d.shape[:2]) / 2
-    x, y = (columns - columns.mean()) / scale, (rows - rows.mean()) / scale
-    one, zero = np.ones_like(x), np.zeros_like(x)
-    design = np.stack([np.stack([one, zero, x, -y], axis=-1), np.stack([zero, one, y, x], axis=-1)], axis=-2)
-    a, b = design[still].reshape(-1, 4), d[still].reshape(-1).astype(np.float64)
-    start = np.linalg.lstsq(a, b, rcond=None)[0]
-    noise = 1.4826 * np.median(np.abs(a @ start - b)) + 1e-6
-    fit = least_squares(lambda p: a @ p - b, start, jac=lambda p: a, loss="cauchy", f_scale=2 * noise)
-    return (d - (design.reshape(-1, 4) @ fit.x).reshape(d.shape)).astype(np.float32)
-
-
-def border(shape: tuple[int, ...], width: int) -> PixelMask:
-    """Return the outer `width` px of an image."""
-    if 2 * width >= min(shape):
-        raise InputError(f"expected less than half the image ({min(shape) // 2} px), got {width}", field="shake_border")
-    mask = np.ones(shape, dtype=bool)
-    mask[width:-width, width:-width] = False
-    return mask
+def _without_shake(d: Vectors, settings: DisplacementSettings, measured: PixelMask | bool = True) -> Vectors:
+    return remove_shake(d, border(d.shape[:2], settings.shake_border) & measured) if settings.shake_border else d
 
 
 def _equalised(flow: Image, reference: Image, window: int) -> tuple[Image, Image]:

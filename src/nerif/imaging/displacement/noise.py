@@ -11,6 +11,7 @@ __all__ = ["FLOOR", "local_correlation", "smoothing_error", "structure_variance"
 
 Grey = Shaped[np.ndarray, "row column"]
 FLOOR = 1e-3  # px, lower limit of the error of an optical flow
+WIDER = 1.5  # window of the smoothing error, over that of the method (docs/decisions/065)
 
 
 def structure_variance(flow: Grey, prediction: Grey, reach: float) -> Float[np.ndarray, "row column 2"]:
@@ -29,12 +30,16 @@ def structure_variance(flow: Grey, prediction: Grey, reach: float) -> Float[np.n
 
 
 def smoothing_error(d: Shaped[np.ndarray, "row column 2"], reach: float) -> Float[np.ndarray, "row column 2"]:
-    """Return the local rms of the part of d that a Gaussian window removes, px."""
-    from scipy.ndimage import gaussian_filter
+    """Return the local rms of the part of d that a Gaussian window of 1.5 reach removes, px.
 
-    d = as_float(d)
-    parts = [gaussian_filter((d[..., k] - gaussian_filter(d[..., k], reach)) ** 2, reach) for k in range(2)]
-    return np.sqrt(np.stack(parts, axis=-1))
+    Of its square the largest value within the reach counts: of a front that is thinner than the window, the measured d
+    shows neither the place nor the height.
+    """
+    from scipy.ndimage import gaussian_filter, maximum_filter
+
+    d, edge = as_float(d), 2 * round(reach) + 1
+    parts = [(d[..., k] - gaussian_filter(d[..., k], WIDER * reach)) ** 2 for k in range(2)]
+    return np.sqrt(np.stack([gaussian_filter(maximum_filter(part, edge), reach) for part in parts], axis=-1))
 
 
 def local_correlation(a: Grey, b: Grey, reach: float) -> Float[np.ndarray, "row column"]:
