@@ -6,17 +6,20 @@ import json
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
+from scipy.ndimage import gaussian_filter
 
 from nerif.analysis.evaluation import evaluate_views, evaluate_volume
-from nerif.analysis.prediction import predict_view, reproject
+from nerif.analysis.prediction import predict, predict_view, reproject
 from nerif.data.volume import Volume
 from nerif.fields.grid import Boundary, VoxelField
 from nerif.fields.phantoms import GaussianBalls
 from nerif.forward.deflection import MODELS
 from nerif.forward.path_integral import PathIntegral, project
-from nerif.geometry import Grid
+from nerif.geometry import Grid, Ring
+from nerif.imaging.displacement.warping import warp
 from nerif.results.directory import METRICS, ResultDirectory
 from refusals import refused
 
@@ -27,6 +30,24 @@ def test_the_residual_of_the_true_field_is_the_noise(measurement, ball):
     for v in views:
         assert v["rms_over_sigma"] == pytest.approx(1, abs=0.12)
         assert v["cc"] > 0.999
+
+
+def test_displacements_by_windows_are_compared_with_averages_where_the_images_were_measured(measurement, ball):
+    cameras = Ring(views=2, image_size=(72, 88), pixel_pitch=0.02).cameras()
+    rng, data = np.random.default_rng(0), predict(ball, cameras, measurement.box, measurement.n_ambient)
+    exact = data.displacement.nan_to_num(0.0).numpy()
+    shape = exact.shape[:3]
+    sigma = 0.03 * float(np.sqrt(np.mean(exact**2)))
+    windows = gaussian_filter(exact, (0, 1.8, 1.8, 0)) + sigma * rng.standard_normal(exact.shape)
+    still = gaussian_filter(rng.random(shape), (0, 0.8, 0.8))
+    images = {"reference": still, "flow": np.stack([warp(s, -d) for s, d in zip(still, exact, strict=True)])}
+    maps = {name: torch.from_numpy(grey).float() for name, grey in images.items()}
+    alone = replace(data, displacement=torch.from_numpy(windows).float(), sigma=torch.full(exact.shape, sigma))
+    with_images = replace(alone, maps=maps | {"image_sigma": torch.full(shape, 0.01)})
+    for data, cause in ((alone, "blur"), (with_images, "")):
+        views = [v for v in evaluate_views(reproject(ball, data)) if v["measured"] == "displacement"]
+        assert {v["residual_test"]["cause"] for v in views} == {cause}
+    assert max(v["rms_over_sigma"] for v in views) < 1.3
 
 
 def test_a_field_ten_per_cent_too_strong(measurement, ball):

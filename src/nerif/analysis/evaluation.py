@@ -27,6 +27,7 @@ from nerif.data.volume import INDEX, Volume
 from nerif.data.volume_file import read_volume
 from nerif.fields.base import Field
 from nerif.fields.grid import VoxelField
+from nerif.forward.base import masked_blur
 from nerif.forward.registry import AUTO, forward_model
 from nerif.geometry import Box
 from nerif.geometry.body import contained
@@ -38,6 +39,7 @@ from nerif.results.metrics import Metrics, ViewScores
 
 FLOW = 0.02  # share of the largest excess, above which a voxel counts as flow
 ALIGNMENTS = ("none", "rigid")
+WINDOWS = 0.5, 5.0  # px, standard deviations of windows of optical flow
 PARALLEL_PIXELS = 8e6  # of the views that are scored at a time: about 0.1 GiB per megapixel
 
 __all__ = [
@@ -114,12 +116,14 @@ def evaluate(
 def evaluate_views(reprojection: Reprojection) -> list[ViewScores]:
     """Compare every view with its prediction over the usable pixels whose rays cross the box.
 
-    Of images, their changes by the flow are compared.
+    Of images, their changes by the flow are compared. Displacements that were derived from images are averages over
+    windows, and are compared with averages of their prediction.
     """
     from concurrent.futures import ThreadPoolExecutor
 
     measurement, sees_box = reprojection.measurement, reprojection.measurement.sees_box
     models = {kind: forward_model(kind, measurement) for kind in measurement.techniques if kind.derived}
+    windowed = {kind.derived for kind in models}
     for model in models.values():
         model.prepare()
 
@@ -134,6 +138,8 @@ def evaluate_views(reprojection: Reprojection) -> list[ViewScores]:
         if kind.derived:
             still = models[kind].to_map(torch.zeros(height, width, kind.integrals), view)
             measured, predicted = measured - still, predicted - still
+        if kind.name in windowed:
+            predicted = _by_windows(predicted, measured, mask)
         row |= view_metrics(measured.numpy(), predicted.numpy(), mask.numpy())
         residual = measured - predicted
         row |= {"pixels": int(mask.sum()), "rms_predicted": _rms(predicted[mask]), "rms_measured": _rms(measured[mask])}
@@ -156,6 +162,28 @@ def evaluate_views(reprojection: Reprojection) -> list[ViewScores]:
         with ThreadPoolExecutor(max(threads, 1)) as pool:
             views += pool.map(lambda i, o=o, valid=valid: scores(i, o, valid), indices)
     return views
+
+
+def _by_windows(
+    predicted: Float[Tensor, "row column c"],
+    measured: Float[Tensor, "row column c"],
+    mask: Bool[Tensor, "row column"],
+) -> Float[Tensor, "row column c"]:
+    """The prediction, or its average over the Gaussian window with which it is nearest to the measurement."""
+    from scipy.optimize import minimize_scalar
+
+    seen = predicted.isfinite().all(dim=-1)
+
+    def average(px: float) -> Float[Tensor, "row column c"]:
+        return masked_blur(predicted, seen, px).to(predicted)
+
+    def error(values: Float[Tensor, "row column c"]) -> float:
+        return _rms((measured - values)[mask])
+
+    if not bool(mask.any()):
+        return predicted
+    px = minimize_scalar(lambda px: error(average(px)), bounds=WINDOWS, method="bounded", options={"xatol": 0.03}).x
+    return min(predicted, average(px), key=error)
 
 
 def _rms(values: Tensor) -> float:

@@ -15,7 +15,8 @@ from nerif.imaging.readers.frames import as_float
 from nerif.imaging.readers.views import View, read_sample
 
 __all__ = [
-    "Thumbnail", "binned", "common_shift", "local_displacement", "match", "parabola", "related", "shifted", "thumbnails",
+    "Thumbnail", "binned", "common_shift", "local_displacement", "match", "parabola", "related", "shifted",
+    "thumbnails",
 ]  # fmt: skip
 
 LONGEST = 256  # px of the longer side
