@@ -27,6 +27,7 @@ def flow(rng: np.random.Generator) -> np.ndarray:
 SPOILT = {
     "offset": lambda d: d + np.array([0.06, -0.03]),
     "calibration": lambda d: shift(d, (0.0, 0.4, 0.0), order=3, mode="nearest"),
+    "rows": lambda d: d + 0.1 * np.sin(np.arange(SHAPE[0]) / 9)[:, None, None] * np.array([1.0, 0.4]),
     "scale": lambda d: 1.15 * d,
     "blur": lambda d: gaussian_filter(d, (1.5, 1.5, 0)),
 }

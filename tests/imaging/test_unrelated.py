@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 import tifffile
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, map_coordinates
 
 from nerif.geometry import Box, Ring
 from nerif.imaging.calibration.cameras_file import CalibratedCamera
@@ -140,3 +140,19 @@ def test_a_camera_that_moved_is_reported_with_its_shift(tmp_path, width):
     expected = [0, 0] if width else [-14, 9]
     assert measurement.displacement[0][30:80, 30:100].mean(dim=(0, 1)).tolist() == pytest.approx(expected, abs=0.05)
     assert bool(measurement.valid[0][30:80, 30:100].all())
+
+
+@pytest.mark.parametrize("source", ["rows", "a jet along the rows", "roll of the camera"])
+def test_rows_that_moved_together_are_reported(tmp_path, source):
+    rows, columns = np.mgrid[: SHAPE[0], : SHAPE[1]].astype(float)
+    u = {
+        "rows": 0.8 * np.sin(rows / 8),
+        "a jet along the rows": 1.5 * np.exp(-(((rows - 50) / 9) ** 2)),
+        "roll of the camera": 0.02 * (rows - 55),
+    }[source]
+    flow = map_coordinates(dots(0), [rows, columns - u], order=3, mode="nearest")
+    recorded, lines = recording(tmp_path, {f"{A}/flow": [flow] * 2}), []
+    ViewReference.of(recorded, recorded.views[0]).measure([0], lines.append)
+    assert [line.split(",")[0] for line in lines] == (
+        [f"note: view '{A}': its rows moved together"] if source == "rows" else []
+    )

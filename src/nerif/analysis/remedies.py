@@ -60,6 +60,7 @@ CAUSES = {
         ),
         "cameras",
     ),
+    "rows": Cause("rows or columns that moved together (a rolling shutter): use a global shutter, or average images"),
     "scale": Cause("a wrong scale: distances, pixel pitch, sensitivity, or an evaluation method that underestimates"),
     "blur": Cause(
         "different sharpness of measurement and field, by windows of optical flow or the lens",

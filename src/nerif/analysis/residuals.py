@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from statistics import NormalDist
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from nerif.common.blocks import blocks
 
@@ -30,6 +30,7 @@ QUARTILE = NormalDist().inv_cdf(0.625)  # of the absolute value of a standard no
 SIGNIFICANT = 4.0  # standard deviations of the grain of white noise
 MIN_GRAIN = {COARSE: 1.25, FINE: 1.1}  # below these, the correlated part is at most about half of the noise in a block
 MIN_SHARE = {COARSE: 0.2, FINE: 0.12}  # of the correlated part, that a cause has to explain
+MIN_ROWS = 0.5  # of it, that the movement of rows has to explain: they have more parameters than other causes
 
 
 @dataclass(frozen=True)
@@ -132,6 +133,8 @@ def _tested(residual: Map, predicted: Map | None, mask: Mask, edge: int) -> _Blo
             _block_sums(np.where(mask[..., None] & np.isfinite(p), p, 0.0), edge)[full] / np.sqrt(n) for p in patterns
         ]
         shares[cause] = _explained(z, np.stack(means, axis=-1))
+    if shares and (share := max(_explained_by_means(z, group) for group in np.argwhere(full).T)) > MIN_ROWS:
+        shares["rows"] = share
     worst = int(np.argmax((z**2).sum(axis=1)))
     row, column = (float(i + 0.5) * edge for i in np.argwhere(full)[worst])
     return _BlockTest(math.sqrt(energy), correlated, shares, row, column)
@@ -151,6 +154,17 @@ def _explained(z: Float[np.ndarray, "b c"], patterns: Float[np.ndarray, "b c pat
     weights, *_ = np.linalg.lstsq(basis, flat, rcond=1e-6)
     explained = float((flat**2).sum() - ((flat - basis @ weights) ** 2).sum()) - basis.shape[1]
     return explained / (float((flat**2).sum()) - flat.size)
+
+
+def _explained_by_means(z: Float[np.ndarray, "b c"], group: Int[np.ndarray, " b"]) -> float:
+    """The share of the excess over white noise that the means of groups explain, beyond the mean of all.
+
+    The median group counts: a shutter moves all rows, flow beyond the box leaves residuals in a few.
+    """
+    _, group, count = np.unique(group, return_inverse=True, return_counts=True)
+    sums = np.stack([np.bincount(group, column) for column in (z - z.mean(axis=0)).T], axis=-1)
+    explained = len(count) * float(np.median((sums**2 / count[:, None]).sum(axis=1))) - (len(count) - 1) * z.shape[1]
+    return explained / (float((z**2).sum()) - z.size)
 
 
 def _patterns(predicted: Map) -> dict[str, list[Map]]:

@@ -27,6 +27,7 @@ from nerif.imaging.displacement.displacement import (
     Reference,
 )
 from nerif.imaging.displacement.repetition import Repetition, repetition
+from nerif.imaging.displacement.shake import row_movement
 from nerif.imaging.masks import MaskSettings, flow_mask
 from nerif.imaging.readers.exposure import check_exposure
 from nerif.imaging.readers.views import View, good_images, paired
@@ -39,6 +40,7 @@ __all__ = ["Recording", "Scene", "Surroundings", "ViewReference", "camera_of", "
 PixelMask = Bool[np.ndarray, "row column"]
 
 AMBIGUOUS = 0.4, 0.005  # part of a period, and share of the pixels displaced by more
+ROWS = 0.1  # px, movement of rows that is reported
 NOTABLE = 0.005  # share of pixels that move too unevenly, from which on it is reported
 FEW = 0.5  # share of valid pixels below which their number is reported
 WORTH_PROCESSES = 2**22  # pixels of all images together
@@ -276,13 +278,19 @@ class ViewReference:
         say(f"note: view '{self.view.name}': {100 * share:.0f} % of its pixels are valid; {result.loss_text}")
 
     def _report_movements(self, result: DisplacementMap, say: Callable[[str], None]) -> None:
-        """Report a shift of the whole image, and displacements that change too much within a window."""
+        """Report a shift of the image or of its rows, and displacements that change too much within a window."""
         settings, name = self.reference.settings, f"note: view '{self.view.name}':"
         if any(result.shift):
             u, v = result.shift
             remedy = "give --shake-border N, the width of a border without flow, to remove it"
             remedy = f"--shake-border {settings.shake_border} removes it" if settings.shake_border else remedy
             say(f"{name} the whole image moved by about ({u}, {v}) px between reference and flow; {remedy}")
+        if (rows := row_movement(result.displacement, result.valid)) > ROWS:
+            say(
+                f"{name} its rows moved together, by {rows:.2f} px (median), as with a rolling shutter and a camera "
+                "that shakes; use a global shutter, or average flow images (--average). A flow of layers across the "
+                "whole image looks the same"
+            )
         if (share := result.losses[UNEVEN]) > NOTABLE:
             largest = np.quantile(np.linalg.norm(result.displacement[result.valid], axis=-1), 1 - NOTABLE)
             say(
