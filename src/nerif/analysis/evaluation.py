@@ -172,10 +172,10 @@ def _by_windows(
     """The prediction, or its average over the Gaussian window with which it is nearest to the measurement."""
     from scipy.optimize import minimize_scalar
 
-    seen = predicted.isfinite().all(dim=-1)
+    finite = predicted.isfinite().all(dim=-1)
 
     def average(px: float) -> Float[Tensor, "row column c"]:
-        return masked_blur(predicted, seen, px).to(predicted)
+        return masked_blur(predicted, finite, px).to(predicted)
 
     def error(values: Float[Tensor, "row column c"]) -> float:
         return _rms((measured - values)[mask])

@@ -203,16 +203,16 @@ class Reference:
             scatter, without_flow = self.noise
             sigma, source = np.sqrt(scatter**2 + np.maximum(sigma**2 - without_flow**2, 0)), "repeats"
         sigma = np.sqrt(sigma**2 + smoothing_error(d, reach) ** 2 + difference / 2).astype(np.float32)
-        shown = _shown(total)
+        inside_reference = _shown(total)
         exposed = ~_dilated(overexposed, 2)
         conditions = {
             OVEREXPOSED: exposed,
-            "outside the reference": shown,
+            "outside the reference": inside_reference,
             "uncorrelated": agreement >= settings.min_correlation,
             UNEVEN: difference.sum(-1) <= settings.max_sigma**2,
             f"with noise above {settings.max_sigma:g} px": sigma.max(-1) <= settings.max_sigma,
         }
-        inside = np.ones(shown.shape, dtype=bool) if region is None else region
+        inside = np.ones(inside_reference.shape, dtype=bool) if region is None else region
         usable, valid, losses = inside & exposed, inside, {}
         for cause, condition in conditions.items():  # a pixel counts for the first cause
             losses[cause] = float((valid & ~condition).sum() / max(int(inside.sum()), 1))
