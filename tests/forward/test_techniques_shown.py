@@ -209,6 +209,10 @@ def test_quantities_of_a_sequence_follow_from_the_measurement(both, absorption):
     assert SequenceSettings().for_measurement(alone).quantities == ("extinction",)
     with refused("quantities"):
         SequenceSettings(quantities=("density",), gas=GasSettings()).for_measurement(alone)
+    water = replace(combined, n_ambient=1.333)
+    assert SequenceSettings().for_measurement(water).quantities == (INDEX,)
+    with refused("quantities"):
+        SequenceSettings(quantities=("temperature",)).for_measurement(water)
 
 
 def test_maps_that_cannot_be_negative_begin_at_zero():

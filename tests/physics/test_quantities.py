@@ -61,10 +61,51 @@ def test_flows_with_compression_and_expansion_have_no_temperature(phantom):
 
 def test_uniform_pressure_follows_from_the_field_unless_stated():
     both = flow(torch.tensor([1e-5, -1e-5] * 12).reshape(2, 3, 4))
-    assert GasSettings().for_field(both).uniform_pressure == "no"
-    assert GasSettings().for_field(flow(torch.full((2, 3, 4), -1e-5))).uniform_pressure == "yes"
+    assert GasSettings().absent(both) == {"temperature": NOT_UNIFORM}
+    assert GasSettings().absent(flow(torch.full((2, 3, 4), -1e-5))) == {}
     assert GasChanges(uniform_pressure="yes").of({"gas": {"uniform_pressure": "no"}}).uniform_pressure == "yes"
     assert GasChanges().of({"gas": {"uniform_pressure": "no"}}).uniform_pressure == "no"
+
+
+BURNT = "N2:0.72, H2O:0.19, CO2:0.09"
+
+
+@pytest.mark.parametrize(
+    ("n_ambient", "excess", "gas", "absent", "words"),
+    [
+        (1.333, -1e-4, {}, "dT", "liquids and plasmas have an index only"),
+        (1.36, 3e-3, {"composition": "N2"}, "dT", "is not that of N2 at 101325 Pa"),
+        (0.9999, -5e-5, {}, "dT", "0.9999 is not that of air"),
+        (1.0, 1e-4, {}, "dT", "is not that of air"),
+        (1.0000326, 2e-5, {}, "dT", "--gas.composition"),  # helium around
+        (1.0000326, 5e-6, {"composition": "He"}, "", ""),
+        (1.0007, -1e-4, {}, "dT", "--gas.composition"),  # sulphur hexafluoride around
+        (1.00135, -1e-4, {}, "dT", "--gas.pressure-pa"),  # air at 5 bar
+        (1.00135, -1e-4, {"pressure_pa": 5e5}, "", ""),
+        (1.00027, -2.37e-4, {}, "dT", "hotter than 2300 K"),  # helium in air
+        (1.00027, -2.9e-4, {"composition": BURNT}, "dT", "hotter than 4000 K"),
+        (1.00027, -2.37e-4, {"composition": BURNT}, "", ""),  # hot products
+        (1.00027, -2.37e-4, {"uniform_pressure": "yes"}, "", "helium or fuel"),
+        (1.00027, -2.37e-4, {"uniform_pressure": "no"}, "T", "not uniform"),
+        (1.00027, -2.2e-4, {}, "", "helium or fuel"),  # a flame, or a diluted jet of helium
+        (1.00027, 4.3e-4, {}, "dT", "colder than 200 K"),  # sulphur hexafluoride in air
+        (1.00027, -1e-4, {}, "", ""),
+    ],
+)
+def test_quantities_of_another_medium_are_left_out_with_the_reason(n_ambient, excess, gas, absent, words):
+    """A core within a thin edge, of some per cent of the box."""
+    grid = Grid(Box.cube(20.0), (20, 21, 22))
+    radius = grid.points(torch.float64).square().sum(dim=-1).sqrt()
+    volume = Volume(excess * torch.sigmoid(3 * (5.0 - radius)), grid, attributes={"n_ambient": n_ambient})
+    settings = GasSettings(**gas)
+    left_out = {name for name, letter in (("density", "d"), ("temperature", "T")) if letter in absent}
+    written = {v.quantity for v in derive_all(volume, settings)}
+    assert written == {"index_excess", "n", "density", "temperature"} - left_out
+    assert bool(derive(volume, "density", settings).values.isnan().all()) == ("d" in absent)
+    lines = settings.remarks(volume)
+    assert len(lines) == bool(words)
+    assert words in " ".join(lines)
+    assert bool(lines and "not computed" in lines[0]) == bool(absent)
 
 
 def test_invalid_quantities_and_gases_are_refused():

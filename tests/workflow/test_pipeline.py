@@ -58,6 +58,16 @@ def test_the_directory_is_complete_and_kept(made, measurement, capsys):
         reconstruct_into(out.path, measurement, QUICK)
 
 
+@pytest.mark.parametrize("n_ambient", [1.333, 0.9997])
+def test_water_and_plasma_have_an_index_only(measurement, tmp_path, n_ambient):
+    lines: list[str] = []
+    reconstruct_into(tmp_path, replace(measurement, n_ambient=n_ambient), QUICK, RUN, monitor=Monitor(say=lines.append))
+    assert sum("density and temperature: not computed: the ambient index" in line for line in lines) == 1
+    assert set(ResultDirectory(tmp_path).read().volumes) == {"index_excess", "n"}
+    assert main(["export", str(tmp_path), "-o", str(tmp_path / "f.vti"), "--voxels", "8"]) == 0
+    assert main(["export", str(tmp_path), "-o", str(tmp_path / "g.vti"), "--quantities", "density"]) == 2
+
+
 @pytest.mark.skipif(os.name == "nt", reason="modes of POSIX")
 def test_others_may_read_the_files_as_any_new_file(made, tmp_path):
     (tmp_path / "new").touch()

@@ -26,7 +26,7 @@ def surface_map(
     field: Field, bodies: Sequence[Body], box: Box, n_ambient: float, edge: float, quantity: str = INDEX,
     gas: GasSettings | None = None,
 ) -> SurfaceMap:  # fmt: skip
-    """Return a field, and of an index the density, on the surface of bodies in triangles with edges up to `edge` mm.
+    """Return a field, and in a gas its density, on the surface of bodies in triangles with edges up to `edge` mm.
 
     Triangles outside the box are left out; they are larger where there would be more than MOST_TRIANGLES. Vertices
     beyond the box or within another body are NaN.
@@ -38,8 +38,7 @@ def surface_map(
     values = torch.cat([field.value(part).double() for part in in_chunks(points.float())])
     values = values.masked_fill(outside, torch.nan)
     quantities, attributes = {quantity: values}, dict[str, float | str]()
-    if quantity == INDEX:
-        gas = gas or GasSettings()
+    if quantity == INDEX and gas is not None:
         k = gladstone_dale(gas.composition, gas.wavelength_nm)
         quantities = {"density": density_from_index(values, n_ambient, k), **quantities}
         attributes = {"n_ambient": n_ambient, "gas": gas.composition, "gladstone_dale_m3_kg-1": k}

@@ -13,7 +13,14 @@ from torch import Tensor
 
 from nerif.common.conventions import InputError, percent
 from nerif.data.volume import QUANTITIES, Volume, quantities_of
-from nerif.physics.gas_optics import density_from_index, gladstone_dale, molar_mass, temperature_from_density
+from nerif.physics.gas_optics import (
+    ambient_index,
+    density_from_index,
+    gladstone_dale,
+    molar_mass,
+    parse_mixture,
+    temperature_from_density,
+)  # fmt: skip
 
 if TYPE_CHECKING:
     from nerif.data.measurement import Measurement
@@ -22,11 +29,17 @@ __all__ = ["NOT_UNIFORM", "GasChanges", "GasSettings", "derive", "derive_all", "
 
 TEMPERATURE_RANGE = 200.0, 4000.0
 """K; outside, gases of the table condense or dissociate."""
+AMBIENT_RANGE = 200.0, 2000.0  # K, of the gas around a flow
+HOTTEST = 2300.0  # K, of flames in air; helium in air appears as air of 2400 K
+PRODUCTS = "H2O", "CO2"  # a composition without them is not that of a flame
+COMMON = 230.0, 1000.0  # K; beyond, a flow in air is a flame, cryogenic, or another gas
 
 BOTH_SIGNS, EXTREME = 0.4, 1e-3
 """Ratio of the smaller to the larger extreme of the density differences above and below ambient from which compression
 and expansion are assumed (in a flow at uniform pressure the smaller is the error of the field); share of the voxels
 beyond each extreme."""
+SOME = 0.1  # the same ratio for a field that is denser than any gas at uniform pressure
+FLOW, QUARTER = 0.5, 0.25  # voxels of the flow, relative to the extreme; share of these beyond a temperature
 
 NOT_UNIFORM = (
     "the pressure is not uniform (density is both above and below ambient, as behind compression and expansion waves); "
@@ -58,21 +71,80 @@ class GasSettings:
             return self
         wavelength = measurement.wavelength_nm
         gas = self if wavelength is None else replace(self, wavelength_nm=wavelength)
-        density_from_index(0.0, measurement.n_ambient, gladstone_dale(gas.composition, gas.wavelength_nm))
+        gladstone_dale(gas.composition, gas.wavelength_nm)
         return gas
 
-    def for_field(self, excess: Volume) -> GasSettings:
-        """Return the settings with yes or no for the uniform pressure of a field."""
+    def not_around(self, n_ambient: float) -> str:
+        """Return why the gas is not the medium around a flow, by the ambient index; empty if it may be."""
+        low, high = AMBIENT_RANGE
+        thin, dense = (ambient_index(self.composition, t, self.pressure_pa, self.wavelength_nm) for t in (high, low))
+        if thin <= n_ambient <= dense:
+            return ""
+        return (
+            f"the ambient index {n_ambient:.10g} is not that of {self.composition} at {self.pressure_pa:g} Pa "
+            f"({thin:.7f} to {dense:.7f} for {high:g} to {low:g} K); give --gas.composition and --gas.pressure-pa, or "
+            "the n_ambient of the measurement; liquids and plasmas have an index only"
+        )
+
+    def absent(self, excess: Volume) -> dict[str, str]:
+        """Return the quantities that do not follow from a field of this gas, each with the reason."""
+        if "density" not in quantities_of(excess.quantity):
+            return {}
+        if reason := self.not_around(float(excess.attributes["n_ambient"])):
+            return {"density": reason, "temperature": reason}
         if self.uniform_pressure != "auto":
-            return self
-        low, high = np.quantile(excess.values.nan_to_num(0.0).numpy(), [EXTREME, 1 - EXTREME])
-        both = min(high, -low) > BOTH_SIGNS * max(high, -low)
-        return replace(self, uniform_pressure="no" if both else "yes")
+            return {} if self.uniform_pressure == "yes" else {"temperature": NOT_UNIFORM}
+        below, above, cold, hot = self._ends(excess)
+        (coldest, most), ratio = TEMPERATURE_RANGE, min(above, below) / (max(above, below) or 1.0)
+        hottest = most if self._burnt else HOTTEST
+        if ratio > BOTH_SIGNS or (ratio > SOME and cold < coldest):
+            return {"temperature": NOT_UNIFORM}
+        if coldest <= cold and hot <= hottest:
+            return {}
+        end = f"hotter than {hottest:g} K" if hot > hottest else f"colder than {coldest:g} K"
+        reason = (
+            f"{QUARTER:.0%} of the flow would be {self.composition} {end} at a uniform pressure: it is another gas "
+            "(--gas.composition), or the pressure varies (--gas.uniform-pressure no computes density alone, yes both)"
+        )
+        return {"density": reason, "temperature": reason}
+
+    def remarks(self, excess: Volume) -> list[str]:
+        """Return lines on the quantities that do not follow from a field, and on what its temperature implies."""
+        absent = self.absent(excess)
+        lines = [
+            f"{' and '.join(q for q in absent if absent[q] == reason)}: not computed: {reason}"
+            for reason in dict.fromkeys(absent.values())
+        ]
+        if self._burnt or "temperature" not in self.quantities_of(excess):
+            return lines
+        _, _, *ends = self._ends(excess)
+        extreme = [t for t, beyond in zip(ends, (ends[0] < COMMON[0], ends[1] > COMMON[1]), strict=True) if beyond]
+        return lines + [
+            f"temperature: {QUARTER:.0%} of the flow is beyond {t:.0f} K if it is {self.composition}; density and "
+            "temperature are wrong where another gas flows, such as helium or fuel (--gas.composition)"
+            for t in extreme
+        ]
+
+    @property
+    def _burnt(self) -> bool:
+        return any(parse_mixture(self.composition).get(product) for product in PRODUCTS)
+
+    def _ends(self, excess: Volume) -> tuple[float, float, float, float]:
+        """Return how far the index is below and above ambient, and the temperatures (K) below and above which a quarter
+        of the denser and of the lighter flow is."""
+        n_ambient = float(excess.attributes["n_ambient"])
+        values = np.append(excess.values.double().nan_to_num(0.0).numpy(), 0.0)  # the ambient, for fields of one sign
+        low, high = np.quantile(values, [EXTREME, 1 - EXTREME]).clip((-math.inf, 0.0), (0.0, math.inf))
+        of_flow = (np.quantile(values[values >= FLOW * high], 1 - QUARTER),
+                   np.quantile(values[values <= FLOW * low], QUARTER))  # fmt: skip
+        density = density_from_index(np.array(of_flow), n_ambient, gladstone_dale(self.composition, self.wavelength_nm))
+        cold, hot = temperature_from_density(density, self.pressure_pa, molar_mass(self.composition))
+        return -float(low), float(high), float(cold), math.inf if math.isnan(hot) else float(hot)
 
     def quantities_of(self, excess: Volume) -> tuple[str, ...]:
-        """Return the quantities of a field: without temperature if the pressure is not uniform."""
-        uniform = self.for_field(excess).uniform_pressure == "yes"
-        return tuple(q for q in quantities_of(excess.quantity) if uniform or q != "temperature")
+        """Return the quantities of a field, without those that are absent."""
+        absent = self.absent(excess)
+        return tuple(q for q in quantities_of(excess.quantity) if q not in absent)
 
 
 @dataclass(frozen=True)
@@ -100,8 +172,8 @@ def derive(excess: Volume, quantity: str, gas: GasSettings) -> Volume:
 
         rho = (n - 1) / K,      T = p M / (R rho)
 
-    Values outside the relations (n - 1 <= 0, temperature outside 200 to 4000 K or at non-uniform pressure) are NaN; the
-    notes contain their number and the assumptions.
+    Values outside the relations (n - 1 <= 0, temperature outside 200 to 4000 K, everything that is absent from a field
+    of this gas) are NaN; the notes contain their number, the reason and the assumptions.
 
     Parameters
     ----------
@@ -124,21 +196,22 @@ def derive(excess: Volume, quantity: str, gas: GasSettings) -> Volume:
         f"n - 1 = K rho (Gladstone-Dale) with K = {k:.5g} m3/kg of {gas.composition} at {gas.wavelength_nm:g} nm, "
         "one composition throughout"
     )
-    density = density_from_index(excess.values.double(), n_ambient, k)
-    if quantity == "density":
-        values, where = density.masked_fill(~(density > 0), math.nan), "n - 1 <= 0"
-    else:
-        mass, (low, high) = molar_mass(gas.composition), TEMPERATURE_RANGE
+    mass, (low, high) = molar_mass(gas.composition), TEMPERATURE_RANGE
+    if quantity == "temperature":
         attributes |= {"pressure_pa": gas.pressure_pa, "molar_mass_kg_mol-1": mass}
         assumption = (
             f"T = p M / (R rho), an ideal gas of M = {mass * 1e3:.4g} g/mol ({gas.composition}) "
             f"at a uniform pressure of {gas.pressure_pa:g} Pa; {assumption}"
         )
-        values = temperature_from_density(density, gas.pressure_pa, mass)
-        values = values.masked_fill((values < low) | (values > high), math.nan)
-        where = f"n - 1 <= 0, or temperature beyond {low:g} to {high:g} K"
-        if gas.for_field(excess).uniform_pressure == "no":
-            values, where = torch.full_like(values, math.nan), NOT_UNIFORM
+    if reason := gas.absent(excess).get(quantity):
+        values, where = torch.full_like(excess.values, math.nan), reason
+    else:
+        density = density_from_index(excess.values.double(), n_ambient, k)
+        values, where = density.masked_fill(~(density > 0), math.nan), "n - 1 <= 0"
+        if quantity == "temperature":
+            values = temperature_from_density(density, gas.pressure_pa, mass)
+            values = values.masked_fill((values < low) | (values > high), math.nan)
+            where += f", or temperature beyond {low:g} to {high:g} K"
     count, earlier = int(torch.isnan(values).sum()), int(excess.notes.get("masked_voxels", 0))
     if earlier:
         where = f"{excess.notes['masked_where']}, or {where}" if count > earlier else str(excess.notes["masked_where"])
@@ -163,7 +236,7 @@ def deviation(excess: Volume, std: Tensor, quantity: str, gas: GasSettings) -> T
 
 
 def derive_all(excess: Volume, gas: GasSettings) -> list[Volume]:
-    """Return index_excess, n, density and, at uniform pressure, temperature; other quantities unchanged."""
+    """Return index_excess, n, and density and temperature where they follow; other quantities unchanged."""
     return [derive(excess, quantity, gas) for quantity in gas.quantities_of(excess)]
 
 

@@ -78,9 +78,10 @@ def scene_over_time(store: VolumeSequence, frames: list[int], field: str) -> tup
     packed = [packing.pack(v.values.double().numpy(), packing.COARSE) for v in small]
     gas = GasSettings(**store.attributes["gas"]) if "gas" in store.attributes else None
     quantities = {}
-    names = plotted_quantities(quantities_of(field))
-    for name in names if gas is not None else names[:1]:
-        sample = [derive(v, name, gas or GasSettings()) for v in small[:: max(1, len(small) // 8)]]
+    some = small[:: max(1, len(small) // 8)]
+    absent = {name for v in some for name in gas.absent(v)} if gas is not None else {"density", "temperature"}
+    for name in plotted_quantities([q for q in quantities_of(field) if q not in absent]):
+        sample = [derive(v, name, gas or GasSettings()) for v in some]
         ends = [colour_range(plotted_values(v)) for v in sample]
         quantities[name] = {
             **_quantity(name, sample[0], float(np.median([default_level(v) for v in sample]))),

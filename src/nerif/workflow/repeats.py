@@ -80,7 +80,7 @@ class Members:
         """
         say, start, word, count = self.monitor.say, time.monotonic(), "uncertainty", self.trials.members
         base = Original(main, self.reconstructor, self.training, lambda *data: self._projections(main, *data), self.rig)
-        deviations = BootstrapDeviations(quantities[0], gas.for_field(quantities[0]), base)
+        deviations = BootstrapDeviations(quantities[0], gas, base)
         diverged = []
         for number in range(1, count + 1):
             member = self.trials.member(number, base)

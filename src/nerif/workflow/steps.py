@@ -21,10 +21,10 @@ from nerif.analysis.verdict import verdict
 from nerif.common.conventions import unit_shown
 from nerif.common.installation import word_of
 from nerif.data.measurement import Measurement
-from nerif.data.volume import describe, quantities_of
+from nerif.data.volume import describe
 from nerif.geometry import Grid
 from nerif.imaging.calibration.cameras_file import CalibratedCamera, write_cameras
-from nerif.physics.quantities import NOT_UNIFORM, masked_lines
+from nerif.physics.quantities import masked_lines
 from nerif.reconstruction.base import Reconstruction, compose
 from nerif.reconstruction.detail import COARSE, EARLY, ITERATIONS, SIGNIFICANT, Choice, Detail, choose
 from nerif.reconstruction.files import FIELD, checkpoints
@@ -216,11 +216,8 @@ class WriteField(PipelineStep):
         with job.monitor.counting("sampling the field"):
             volumes = job.quantities = all_quantities(result, job.run.gas, job.voxels)
             out.write_volumes(volumes)
-        for line in masked_lines(volumes):
+        for line in (*masked_lines(volumes), *job.run.gas.remarks(volumes[0])):
             say(line)
-        temperature = "temperature" in quantities_of(job.measurement.quantity)
-        if temperature and all(v.quantity != "temperature" for v in volumes):
-            say(f"temperature: not computed: {NOT_UNIFORM}")
         out.write_metrics(  # without the sections of an earlier field
             Metrics(
                 measurement=job.settings["measurement"], seconds=result.seconds, device=result.device,
@@ -242,7 +239,8 @@ class WriteSurface(PipelineStep):
 
     @staticmethod
     def run(job: Job) -> None:
-        result, gas = the_result(job), job.run.gas
+        result = the_result(job)
+        gas = job.run.gas if any(v.quantity == "density" for v in job.quantities) else None
         edge = max(result.box.edges) / job.voxels
         surface = surface_map(result.field, result.bodies, result.box, result.n_ambient, edge, result.quantity, gas)
         job.out.write_surface(surface)
@@ -340,8 +338,8 @@ class DrawErrors(PipelineStep):
     @staticmethod
     def run(job: Job) -> None:
         assert job.posterior is not None
-        begin, gas = time.monotonic(), job.run.gas.for_field(job.quantities[0])
-        deviations = Deviations(job.quantities[0], gas, the_result(job).bodies)
+        begin = time.monotonic()
+        deviations = Deviations(job.quantities[0], job.run.gas, the_result(job).bodies)
         grid, ratio = Grid.of_resolution(job.measurement.box, VOXELS), 1.0
         if job.detail is not None and (fit := ChooseDetail.coarse(job)) is not None:
             with job.monitor.counting("errors of the withheld view"):

@@ -110,7 +110,7 @@ def velocity_of_film(
     with locked(out), if_interrupted(stopped):
         state = _resumed(checkpoint, inputs, say)
         flow = method(section.of(theta), section.grid, times, update, state, improvement, section.box)
-        result = _write(out, store, theta, times, settings, flow, section)
+        result = _write(out, store, theta, times, settings, flow, section, say)
         checkpoint.unlink(missing_ok=True)
     share = float(np.mean([np.isfinite(result.read("u", k)).mean() for k in range(len(times))]))
     say(
@@ -218,7 +218,7 @@ def _resumed(checkpoint: Path, inputs: str, say: Callable[[str], None]) -> State
 
 def _write(
     out: Path, film: VolumeSequence, theta: Tensor, times: Sequence[float], settings: VelocityFit, flow: Flow,
-    section: Space,
+    section: Space, say: Callable[[str], None],
 ) -> VelocitySequence:  # fmt: skip
     """Write a flow on the grid of the film, in SI units."""
     gas = GasSettings(**film.attributes["gas"]) if "gas" in film.attributes else GasSettings()
@@ -240,6 +240,10 @@ def _write(
         "settings": asdict(settings), "misfit": flow.misfit, "iterations": flow.iterations,
         "seconds": flow.seconds,
     }  # fmt: skip
+    if other := gas.not_around(film.n_ambient):
+        say(f"density and pressure: not computed: {other}")
+        more = [name for name in more if name.removesuffix("_std") not in ("density", "pressure")]
+        del about["reference_density"]
     if symmetry := film.attributes.get("symmetry"):
         about["symmetry"] = symmetry
     residual = _at_instants(flow.transport)
@@ -263,7 +267,8 @@ def _write(
                     arrays["pressure_std"] = pressure.clamp_min(0)
             unknown = ~section.mask(flow.determined[k], flow.grid)
             arrays = {name: values.masked_fill(unknown, math.nan) for name, values in arrays.items()}
-            store.write_frame(k, arrays | {"density": density * (1 - theta[k])})
+            arrays["density"] = density * (1 - theta[k])
+            store.write_frame(k, {name: arrays[name] for name in (*COMPONENTS, *more)})
     return VelocitySequence(out)
 
 

@@ -75,14 +75,18 @@ def run(settings: Export) -> None:
     result = ResultDirectory(settings.result)
     (_, whole, _), quantity = result.field(), result.quantity()
     grid = _grid(settings, whole)
-    quantities = settings.quantities or tuple(q for q in quantities_of(quantity) if q != "temperature")
     with counting_bar("sampling the field"):
-        reconstruction = result.sample(grid)
-        gas = settings.gas.of(result.settings())
-        volumes = [derive(reconstruction, q, gas) for q in quantities]
-        export(settings.out, volumes, settings.force)
-    say(f"{settings.out}: {', '.join(quantities)} on {' x '.join(map(str, grid.shape))} voxels (z, y, x)")
-    for line in masked_lines(volumes):
+        reconstruction, gas = result.sample(grid), settings.gas.of(result.settings())
+    absent = gas.absent(reconstruction)
+    for name in settings.quantities:
+        if name in absent:
+            raise InputError(f"{name} does not follow from the field: {absent[name]}", field="quantities")
+    default = tuple(q for q in quantities_of(quantity) if q not in ("temperature", *absent))
+    volumes = [derive(reconstruction, q, gas) for q in settings.quantities or default]
+    export(settings.out, volumes, settings.force)
+    names = ", ".join(v.quantity for v in volumes)
+    say(f"{settings.out}: {names} on {' x '.join(map(str, grid.shape))} voxels (z, y, x)")
+    for line in (*masked_lines(volumes), *gas.remarks(reconstruction)):
         say(line)
 
 

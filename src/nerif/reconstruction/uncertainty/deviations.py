@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float
@@ -104,7 +105,8 @@ class Deviations:
                     values = self.main.values.double() - z * std  # temperature falls as the index rises
                     n_ambient = float(self.main.attributes.get("n_ambient", 1.0))
                     tail = Volume.of(values, self.main.grid, self.main.quantity, n_ambient)
-                    volumes.append(self._statistic(quantity, name, derive(tail, quantity, self.gas).values.double()))
+                    gas = replace(self.gas, uniform_pressure="yes")  # as in the field
+                    volumes.append(self._statistic(quantity, name, derive(tail, quantity, gas).values.double()))
         return volumes
 
     def _statistic(self, quantity: str, statistic: str, values: Tensor) -> Volume:

@@ -49,15 +49,18 @@ class SequenceSettings:
 
     def for_measurement(self, measurement: Measurement) -> SequenceSettings:
         """Return the settings with the quantities and the gas of a measurement."""
-        available = quantities_of(measurement.quantity)
+        available, gas = quantities_of(measurement.quantity), self.gas.for_measurement(measurement)
+        other = gas.not_around(measurement.n_ambient) if "density" in available else ""
         for quantity in self.quantities:
             if quantity not in available:
                 names = " and ".join(kind.name for kind in measurement.techniques)
                 raise InputError(
                     f"expected some of {', '.join(available)} for {names}, got '{quantity}'", field="quantities"
                 )
-        quantities = self.quantities or tuple(q for q in available if q in (measurement.quantity, "density"))
-        return replace(self, quantities=quantities, gas=self.gas.for_measurement(measurement))
+            if other and quantity in ("density", "temperature"):
+                raise InputError(f"expected index_excess or n, got {quantity}: {other}", field="quantities")
+        default = (measurement.quantity,) if other else (measurement.quantity, "density")
+        return replace(self, quantities=self.quantities or tuple(q for q in available if q in default), gas=gas)
 
 
 @dataclass(frozen=True)
