@@ -15,7 +15,7 @@ from nerif.analysis.verdict import correlated_share, time_of_fit, verdict
 from nerif.common.conventions import percent, with_unit
 from nerif.data.volume import INDEX, field_of, name_of
 from nerif.forward.registry import TECHNIQUES
-from nerif.physics.quantities import NOT_UNIFORM, GasChanges
+from nerif.physics.quantities import GasChanges
 from nerif.plotting.drawing import LABELS, plotted_quantities, plotted_values
 from nerif.plotting.notebook import number, span
 from nerif.reconstruction.base import END
@@ -299,9 +299,10 @@ def _of_truth(result: Result) -> list[Statement]:
 def _of_gas(result: Result) -> list[Statement]:
     if (field := result.field) is None or "gas" not in result.settings or field.n_ambient is None:
         return []
-    lines = GasChanges().of(result.settings).remarks(field)
-    levels = ["note" if line.endswith(NOT_UNIFORM) else "warning" for line in lines]
-    return [Statement(level, f"{line[0].upper()}{line[1:]}.") for level, line in zip(levels, lines, strict=True)]
+    return [
+        Statement("warning" if line.startswith("density") else "note", f"{line[0].upper()}{line[1:]}.")
+        for line in GasChanges().of(result.settings).remarks(field)
+    ]
 
 
 def _of_bootstrap(result: Result) -> list[Statement]:
