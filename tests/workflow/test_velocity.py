@@ -21,7 +21,7 @@ from nerif.geometry import Box, Grid
 from nerif.geometry.symmetry import Symmetry
 from nerif.reconstruction.velocity.assimilation import Iterate, VelocityFit
 from nerif.report import velocity_page
-from nerif.workflow.velocity import velocity_of_film
+from nerif.workflow.velocity import densities, velocity_of_film
 from refusals import refused
 
 pytest.importorskip("zarr", reason="velocities are stored by zarr (the extra `sequence`)")
@@ -33,6 +33,8 @@ N_AMBIENT = 1.00027
 PLUME = Path(__file__).parents[2].parent / "shared" / "data" / "plume" / "plume.nc"
 QUICK = ("--resolution", "12", "--max-iterations", "12", "--time-limit", "0", "--samples", "2",
          "--sample-iterations", "6")  # fmt: skip
+
+ROUGH = ("--resolution", "12", "--max-iterations", "2", "--time-limit", "0", "--samples", "0")
 
 
 def film_of(path: Path, thetas: list[torch.Tensor], grid: Grid, times: tuple[float, ...]) -> Path:
@@ -86,11 +88,32 @@ def test_the_ring_is_found_to_rise_and_the_ambient_is_unknown(velocity: Path):
     assert "standard deviation of the velocity is" in page
 
 
-@pytest.mark.parametrize(("seconds", "limit", "more"), [(30.0, 30.0, True), (20.0, 30.0, False), (20.0, 0.0, False)])
-def test_more_time_is_advised_to_a_fit_that_the_limit_ended(tmp_path: Path, seconds: float, limit: float, more: bool):
-    about = {"misfit": 3.0, "seconds": seconds, "settings": {"time_limit": limit}}
-    store = VelocitySequence.begin(tmp_path / "v.zarr", (0.0,), GRID, (), about)
-    assert ("more time" in velocity_page._statements(store)[0].text) == more
+@pytest.mark.parametrize(
+    ("about", "rating", "words"),
+    [
+        ({}, "Use: ", "1.1 times those of noise"),
+        ({"misfit": 2.0}, "Use with care", "check units"),
+        ({"misfit": 2.0, "falling": True}, "Use with care", "more time"),
+        ({"misfit": 1.1, "falling": True}, "Use with care", "while its residual still fell"),
+        ({"misfit": 3.2}, "Do not use", "3.2 times"),
+        ({"unexplained": 0.1}, "Use with care", "leaves 10% of the acceleration"),
+        ({"unexplained": 0.8}, "Do not use", "leaves 80% of the acceleration"),
+        ({"settings": {"samples": 6}}, "Use with care", "no time for standard deviations"),
+        ({"physics": "transport"}, "Use with care", "no pressure"),
+        ({"known": 0.03}, "Use with care", "known in 3.0% of the box"),
+        ({"known": 0.0}, "Do not use", "known in 0.0% of the box"),
+    ],
+)
+def test_the_verdict_judges_residuals_limits_and_the_share_known(tmp_path: Path, about: dict, rating: str, words: str):
+    share = about.pop("known", 0.4)
+    store = VelocitySequence.begin(tmp_path / "v.zarr", (0.0,), GRID, (), {"misfit": 1.1, "unexplained": 0.01} | about)
+    u = torch.full(GRID.shape, math.nan)
+    u.view(-1)[: round(share * u.numel())] = 1.0
+    store.write_frame(0, {"u": u, "v": u, "w": u})
+    headline = velocity_page._statements(VelocitySequence(store.path))[0]
+    assert headline.text.startswith(rating)
+    assert words in headline.text
+    assert (headline.level == "good") == (rating == "Use: ")
 
 
 def test_report_movie_and_paraview_show_vectors(velocity: Path, tmp_path: Path):
@@ -196,6 +219,47 @@ def test_an_interruption_while_writing_leaves_no_store(film: Path, tmp_path: Pat
             film, tmp_path / "v.zarr", VelocityFit(resolution=8, max_iterations=2, time_limit=0, samples=0)
         )
     assert not (tmp_path / "v.zarr").exists()
+
+
+def test_a_flow_that_moves_as_a_whole_has_its_velocity_and_water_has_no_density(tmp_path: Path, capsys):
+    x, y, z = GRID.points(torch.float32).unbind(-1)
+    centres = ((-9.0, 4.0, -8.0), (2.0, -6.0, 2.0), (-4.0, 3.0, 14.0))
+    thetas = [
+        sum(0.02 * torch.exp(-0.03 * ((x - a - 300.0 * t) ** 2 + (y - b) ** 2 + (z - c) ** 2)) for a, b, c in centres)
+        for t in TIMES
+    ]
+    film = tmp_path / "film.zarr"
+    store = VolumeSequence.create(film, TIMES, GRID, ("index_excess",), 1.333)
+    for k, theta in enumerate(thetas):
+        store.write(k, [Volume.of(-0.333 * theta, GRID, "index_excess", 1.333)])
+    assert run("velocity", film, "-o", tmp_path / "v.zarr", "--physics", "transport", "--frames", "0", "4", *ROUGH) == 0
+    velocity = VelocitySequence(tmp_path / "v.zarr")
+    assert np.nanmean(velocity.read("u", 2)) == pytest.approx(0.3, rel=0.1)
+    assert abs(np.nanmean(velocity.read("v", 2))) < 0.01
+    assert 0.1 < np.isfinite(velocity.read("u", 2)).mean() < 0.8
+    assert "density" not in velocity.quantities
+    printed = capsys.readouterr()
+    assert "density and pressure: not computed: the ambient index 1.333" in printed.out + printed.err
+    assert "Use with care: " in printed.out + printed.err
+
+
+@pytest.mark.parametrize("physics", ["boussinesq", "transport"])
+@pytest.mark.parametrize(("times", "lengths"), [(1e3, 1.0), (1e6, 1.0), (1.0, 1e-3), (1e-6, 1.0)])
+def test_motion_of_wrong_units_is_refused(film: Path, times: float, lengths: float, physics: str):
+    theta = densities(VolumeSequence(film))
+    corners = [tuple(lengths * v for v in corner) for corner in (GRID.box.lower, GRID.box.upper)]
+    with refused("film") as error:
+        VelocityFit(physics=physics).check(theta, Grid(Box(*corners), GRID.shape), [times * t for t in TIMES])
+    assert "instants in s and lengths in mm" in str(error.value)
+
+
+def test_a_velocity_that_does_not_explain_its_film_exits_with_1(film: Path, tmp_path: Path, capsys, monkeypatch):
+    monkeypatch.setattr("nerif.cli.commands.velocity.MOST_MISFIT", 0.01)
+    monkeypatch.setattr("nerif.analysis.velocity_verdict.MISFIT", (0.005, 0.01))
+    assert run("velocity", film, "-o", tmp_path / "v.zarr", "--frames", "0", "3", *ROUGH) == 1
+    printed = capsys.readouterr()
+    assert "Do not use: the density changes" in printed.out + printed.err
+    assert (tmp_path / "v.html").is_file()
 
 
 def test_a_part_of_a_film_has_its_own_instants(film: Path, tmp_path: Path):

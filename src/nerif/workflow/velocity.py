@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from nerif.analysis.velocity_verdict import known_share, velocity_verdict
 from nerif.common.conventions import InputError
 from nerif.common.files import atomic, ending
 from nerif.common.interruption import if_interrupted
@@ -112,11 +113,11 @@ def velocity_of_film(
         flow = method(section.of(theta), section.grid, times, update, state, improvement, section.box)
         result = _write(out, store, theta, times, settings, flow, section, say)
         checkpoint.unlink(missing_ok=True)
-    share = float(np.mean([np.isfinite(result.read("u", k)).mean() for k in range(len(times))]))
     say(
-        f"{out}: {len(times)} instants, velocity known in {share:.0%} of the box, rms residual of transport "
-        f"{flow.misfit:.2f} of its standard deviation, {flow.iterations} iterations, {flow.seconds:.0f} s"
+        f"{out}: {len(times)} instants, velocity known in {known_share(result):.0%} of the box, rms residual of "
+        f"transport {flow.misfit:.2f} of its standard deviation, {flow.iterations} iterations, {flow.seconds:.0f} s"
     )
+    say(velocity_verdict(result).sentence)
     return result
 
 
@@ -238,8 +239,10 @@ def _write(
         "units": "viscosity and diffusivity in m2 s-1, gravity in m s-2, reference_density in kg m-3",
         "density": "film" if flow.theta is None else "improved",
         "settings": asdict(settings), "misfit": flow.misfit, "iterations": flow.iterations,
-        "seconds": flow.seconds,
+        "seconds": flow.seconds, "falling": flow.falling,
     }  # fmt: skip
+    if flow.unexplained is not None:
+        about["unexplained"] = flow.unexplained
     if other := gas.not_around(film.n_ambient):
         say(f"density and pressure: not computed: {other}")
         more = [name for name in more if name.removesuffix("_std") not in ("density", "pressure")]

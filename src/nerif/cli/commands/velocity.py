@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 
 import tyro
 
+from nerif.analysis.velocity_verdict import MOST_MISFIT
 from nerif.cli.arguments import check_output
 from nerif.cli.commands.output import MONITOR, figures_bar
 from nerif.cli.commands.settings import Flat, Settings, command
@@ -53,7 +54,7 @@ def check(out: Path, film: Path, quantities: tuple[str, ...], force: bool) -> No
 
 
 def run(settings: Velocity) -> VelocitySequence:
-    """Compute the velocity, and write its report."""
+    """Compute the velocity, and write its report; exit with 1 if it does not explain the film."""
     check_output(settings.out, settings.force, endings=(".zarr",))
     with figures_bar("velocity") as bar:
 
@@ -76,6 +77,8 @@ def run(settings: Velocity) -> VelocitySequence:
             say=MONITOR.say,
         )
     write_sequence_report(settings.out, monitor=MONITOR)
+    if float(result.attributes["misfit"]) > MOST_MISFIT:
+        raise SystemExit(1)
     return result
 
 

@@ -33,7 +33,7 @@ from nerif.reconstruction.velocity.flow import Flow
 from nerif.reconstruction.velocity.low_mach import LARGEST
 from nerif.reconstruction.velocity.periodic_box import PeriodicBox
 from nerif.reconstruction.velocity.problem import Problem, minimise, resampled
-from nerif.reconstruction.velocity.resampling import smooth
+from nerif.reconstruction.velocity.resampling import laplacian, smooth, squared_slope
 from nerif.reconstruction.velocity.transport import Transport
 
 __all__ = ["PHYSICS", "Improvement", "Iterate", "State", "VelocityFit"]
@@ -45,6 +45,8 @@ STAGES = ((0.67, 0.1), (1.0, 0.8))
 """Voxels along an edge, relative to the finest grid, and the share of the time at which the stage ends."""
 REPEATED_STAGES = ((0.67, 0.08), (0.67, 0.22), (1.0, 0.48), (1.0, 0.8))
 """The same where the density is improved between stages, or the noise estimated from a velocity on the same grid."""
+SPREAD = 1.0  # change of the density by diffusion between two frames, relative to it
+FASTEST = 1.5e5  # mm/s
 MIN_VOXELS = 8  # along the longest edge of the velocity
 ENOUGH = 0.7  # rms of residual / sigma (1 at the true velocity) at which a stage ends: half of the noise is fitted
 IMPROVEMENT = 0.4  # of the time left to a stage, for better densities before it
@@ -153,7 +155,10 @@ class VelocityFit:
             on_iterate(Iterate(what, state.stage, len(stages), state.iterations, seconds, misfit), state)
             return seconds
 
+        first_box = box_of(self._grid(grid, stages[0][0], box_of))
+        common = Problem(self, theta, grid, times, first_box).common_velocity()
         problem: Problem | None = None
+        falling = True
         for stage in range(first, len(stages)):
             share, end = stages[stage]
             if improve is not None and problem is not None:
@@ -167,9 +172,9 @@ class VelocityFit:
                     splines = problem.splines(problem.spectra(_controls(state)))
                 state = replace(state, theta=improve(problem.transport, splines, improved))
             before, density = problem, theta if state.theta is None else state.theta
-            problem = Problem(self, density, grid, times, box_of(self._grid(grid, share, box_of)))
+            problem = Problem(self, density, grid, times, box_of(self._grid(grid, share, box_of)), common)
             if state.controls is None:
-                controls = torch.zeros(len(times), 3, *problem.box.shape)
+                controls = problem.prior.start()
             else:
                 controls = state.controls if before is None else resampled(state.controls, before.box, problem.box)
                 problem.weigh(controls)
@@ -178,15 +183,15 @@ class VelocityFit:
             def progress(misfit: float, best: Tensor, done: int, state: State = state) -> float:
                 return report("velocity", misfit, replace(state, controls=best, iterations=done))
 
-            controls, done = minimise(
+            controls, done, falling = minimise(
                 problem, controls, self.max_iterations, state.iterations, end * limit, progress, enough=ENOUGH
             )
             state = replace(state, controls=controls, iterations=done)
         assert problem is not None
-        flow = problem.flow(_controls(state))
+        flow = problem.flow(_controls(state), falling)
         deviations = None
         if self.samples:
-            coarse = Problem(self, density, grid, times, box_of(self._grid(grid, SAMPLED, box_of)))
+            coarse = Problem(self, density, grid, times, box_of(self._grid(grid, SAMPLED, box_of)), common)
             around = resampled(_controls(state), problem.box, coarse.box)
             deviations = deviations_of(
                 coarse, around, self.samples, self.sample_iterations,
@@ -201,8 +206,8 @@ class VelocityFit:
         Raises
         ------
         InputError
-            For less than three frames, instants that do not increase, thin boxes, NaN, densities that do not vary, and
-            those outside the physics.
+            For less than three frames, instants that do not increase, thin boxes, NaN, densities that do not vary,
+            those outside the physics, and motion that shows wrong units.
         """
         if len(times) < 3:
             raise InputError(f"expected three frames or more, got {len(times)}", field="film")
@@ -232,6 +237,27 @@ class VelocityFit:
             )  # fmt: skip
         if not float((theta[1:] - theta[:-1]).abs().max()) > 0:
             raise InputError("the density does not change in time, so that nothing shows the velocity", field="film")
+        if reason := self._beyond(smooth(theta, SMOOTH), grid, float(torch.tensor(times).double().diff().median())):
+            raise InputError(
+                f"{reason}; expected instants in s and lengths in mm, and frames that show the flow in motion",
+                field="film",
+            )
+
+    def _beyond(self, theta: Tensor, grid: Grid, interval: float) -> str:
+        """Return what no film shows between two frames; empty if there is none."""
+        size = theta.square().mean().sqrt()
+        spread = self.diffusivity * interval * float(laplacian(theta, grid.spacing[::-1]).square().mean().sqrt() / size)
+        fall = 0.5 * float(theta.abs().max() * torch.tensor(self.gravity).norm()) * interval**2
+        slope = squared_slope(theta, grid.spacing[::-1]).mean().sqrt()
+        speed = float(theta.diff(dim=0).square().mean().sqrt() / slope) / interval
+        begin = f"in {interval:g} s, from one frame to the next,"
+        if spread > SPREAD:
+            return f"{begin} diffusion would change the density by {spread:.2g} times its rms"
+        if self.physics != "transport" and fall > max(grid.box.edges):
+            return f"{begin} buoyancy would move the fluid by {fall:.3g} mm, beyond the box"
+        if speed > FASTEST:
+            return f"the density moves with about {speed / 1e3:.3g} m/s, faster than in an incompressible flow"
+        return ""
 
     def _grid(self, grid: Grid, share: float, box_of: type[PeriodicBox]) -> Grid:
         count = max(MIN_VOXELS, round(self.resolution * share))

@@ -85,6 +85,9 @@ class AxisymmetricBox(PeriodicBox):
         a, b = self._coefficients(spectrum)
         return self._vectors(a * gain, b * gain)
 
+    def uniform(self, velocity: Float[Tensor, 3]) -> Complex[Tensor, "3 z y xr"]:
+        return super().uniform(velocity * torch.tensor([0.0, 0.0, 1.0]))  # along the axis
+
     def velocity(self, vorticity: Float[Tensor, "3 z y x"]) -> Complex[Tensor, "3 z y xr"]:
         stream = self._series_of(vorticity[1], ODD) * self._inverse  # of J1: u = curl(stream e_phi)
         return self._vectors(-1j * self._kz * stream, self._kr * stream)

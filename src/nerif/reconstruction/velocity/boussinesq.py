@@ -6,8 +6,8 @@ Semi-Lagrangian, of second order: the fluid that arrives at a node brings its ve
 from where it was, found by the midpoint rule on cubic splines of the velocity halfway in time. Viscosity, exactly in
 Fourier space, acts on what is brought; the half of the force at arrival follows. Pressure by projection.
 
-The net flux through the periodic box is 0 at all instants, as in a closed vessel: velocities follow from vorticity, and
-the mean of the buoyancy is balanced by a mean gradient of pressure. In the open, where the air flows back far away, the
+The mean velocity of the periodic box is given: what follows from vorticity has none, and the mean of the buoyancy is
+balanced by a mean gradient of pressure, as in a closed vessel. In the open, where the air flows back far away, the
 margins hold the return flow (decision 061).
 
 Source: Staniforth & Cote, Mon. Weather Rev. 119 (1991) 2206; Chorin, Math. Comput. 22 (1968) 745.
@@ -53,7 +53,7 @@ class Boussinesq:
 
     def solve(
         self, start: Spectrum, theta: Float[Tensor, "t z y x"], intervals: Sequence[float],
-        changes: Sequence[Spectrum] | None = None,
+        changes: Sequence[Spectrum] | None = None, mean: Float[Tensor, "t 3"] | None = None,
     ) -> list[Spectrum]:  # fmt: skip
         """Return the spectra of the velocity at all instants, mm/s.
 
@@ -63,8 +63,10 @@ class Boussinesq:
         theta : at all instants
         intervals : between them, s
         changes : of the velocity at each later instant, which the equations do not explain
+        mean : velocity at all instants, mm/s; 0 by default
         """
-        box, velocities = self.box, [start + self._expansion(theta[0])]
+        means = [self.box.uniform(u) for u in (torch.zeros(len(theta), 3) if mean is None else mean)]
+        box, velocities = self.box, [start + means[0] + self._expansion(theta[0])]
         pressed = self._pressed(velocities[0], theta[0], (theta[1] - theta[0]) / intervals[0])
         of_buoyancy = box.spectrum(self._buoyancy(theta))
         splines = box.spline(of_buoyancy)
@@ -79,6 +81,7 @@ class Boussinesq:
             velocity, pressed = self._projected(
                 brought - half * of_buoyancy[k + 1], theta[k], theta[k + 1], seconds, pressed
             )
+            velocity = velocity + means[k + 1]
             if changes is not None:
                 velocity = velocity + changes[k]
             velocities.append(velocity)

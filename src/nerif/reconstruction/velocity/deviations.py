@@ -45,16 +45,16 @@ def deviations_of(
         seconds = report(misfit)
         return seconds
 
-    near, _ = minimise(problem, controls, iterations, 0, limit, progress)
+    near, *_ = minimise(problem, controls, iterations, 0, limit, progress)
     problem.weigh(near)  # the residual of controls from another grid does not show the noise
-    centre, _ = minimise(problem, near, iterations, 0, limit, progress)
+    centre, *_ = minimise(problem, near, iterations, 0, limit, progress)
     mean = problem.flow(centre)
     velocity = torch.zeros_like(mean.velocity)
     pressure = None if mean.pressure is None else torch.zeros_like(mean.pressure)
     count = 0
     for _ in range(samples):
         noise = problem.sample(generator)
-        minimum, _ = minimise(problem, centre + noise.controls, iterations, 0, limit, progress, noise)
+        minimum, *_ = minimise(problem, centre + noise.controls, iterations, 0, limit, progress, noise)
         if seconds > limit:  # not at its minimum
             break
         flow, count = problem.flow(minimum), count + 1

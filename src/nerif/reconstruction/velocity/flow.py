@@ -41,8 +41,10 @@ class Flow:
     momentum : change of momentum that the equations do not explain in each interval, mm/s^2; None as above
     determined : voxels in which the density is carried, so that the velocity is known
     misfit : rms of residual / sigma
+    unexplained : rms of `momentum` over that of the acceleration of the fluid, in `determined`; None as above
     theta : of the film, if it was improved
     deviations : of velocity and pressure, if computed
+    falling : whether the residual was still falling when the fit ended
     iterations, seconds : of the fit
     """
 
@@ -53,7 +55,9 @@ class Flow:
     momentum: Float[Tensor, "k 3 z y x"] | None
     determined: Bool[Tensor, "t z y x"]
     misfit: float
+    unexplained: float | None = None
     theta: Float[Tensor, "t z y x"] | None = None
     deviations: Deviations | None = None
+    falling: bool = False
     iterations: int = 0
     seconds: float = 0.0

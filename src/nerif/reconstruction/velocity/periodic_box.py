@@ -101,6 +101,10 @@ class PeriodicBox:
         """
         return spectrum * response(self.wave_square)
 
+    def uniform(self, velocity: Float[Tensor, 3]) -> Complex[Tensor, "3 z y xr"]:
+        """Return the spectrum of a uniform velocity."""
+        return self.spectrum(velocity[:, None, None, None].expand(3, *self.shape))
+
     def velocity(self, vorticity: Float[Tensor, "3 z y x"]) -> Complex[Tensor, "3 z y xr"]:
         """Return the spectrum of the velocity of divergence 0, and mean 0, with a vorticity: u = curl w / k^2."""
         w = self.spectrum(vorticity) * (1j * self.inverse_square)

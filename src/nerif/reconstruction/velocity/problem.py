@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -15,6 +16,7 @@ from torch import Tensor
 from nerif.common.conventions import InputError
 from nerif.geometry import Grid
 from nerif.reconstruction.velocity.boussinesq import Boussinesq
+from nerif.reconstruction.velocity.correlation import common_velocity
 from nerif.reconstruction.velocity.flow import Flow
 from nerif.reconstruction.velocity.low_mach import LowMach
 from nerif.reconstruction.velocity.periodic_box import PeriodicBox
@@ -37,6 +39,8 @@ __all__ = ["Problem", "Sample", "minimise", "resampled"]
 HISTORY = 60  # steps that L-BFGS remembers
 CALM = (2.0, 2.0, 2.0)  # voxels of the velocity over which the scalar is compared
 FREE_FORCING = 0.5  # change of vorticity per interval, relative to its largest value, without an equation of momentum
+MOST = 0.1  # of the squared residual at rest: a flow moves as a whole if that leaves less (a plume: 0.2)
+RECENT, FALLING = 10, 0.02  # evaluations, and the share by which the objective falls in them before the minimum
 GAINS = 2.0  # vorticity, relative to that of a flow which changes the density at the rate in the film
 
 
@@ -53,11 +57,12 @@ class _End(Exception):
 
 
 class Problem:
-    """The fit on one grid."""
+    """The fit on one grid; the mean velocity is free, about `common` (mm/s), if that is not 0."""
 
     def __init__(
-        self, settings: VelocityFit, theta: Tensor, grid: Grid, times: Sequence[float], box: PeriodicBox
-    ) -> None:
+        self, settings: VelocityFit, theta: Tensor, grid: Grid, times: Sequence[float], box: PeriodicBox,
+        common: Float[Tensor, 3] | None = None,
+    ) -> None:  # fmt: skip
         self.settings, self.box = settings, box
         noise = settings.density_noise or noise_of(theta, grid, box.grid)
         equations = LowMach if settings.physics == "low-mach" else Boussinesq
@@ -65,21 +70,32 @@ class Problem:
         gravity = settings.gravity if forces else (0.0, 0.0, 0.0)
         self.equations = equations(box, settings.viscosity, settings.diffusivity, gravity)
         self.transport = Transport(theta, grid, times, self.equations.rate(theta, grid), box, noise)
-        average = self.transport.coarse(theta)
+        self.average = average = self.transport.coarse(theta)
         rate = (theta[1:] - theta[:-1]).square().mean().sqrt() / float(self.transport.intervals.mean())
         slope = squared_slope(theta, grid.spacing[::-1])
         speed = float(rate / slope.mean().sqrt())
         steepness = float(slope.max().sqrt() / theta.abs().max())
         forcing = settings.forcing if forces else FREE_FORCING
         amplitude = GAINS * speed * steepness
-        self.prior = VorticityPrior(box, average, amplitude, forcing, settings.correlation, gravity)
+        self.prior = VorticityPrior(box, average, amplitude, forcing, settings.correlation, gravity, common)
         self.extended = box.extended(average)
+
+    @torch.no_grad()
+    def common_velocity(self) -> Float[Tensor, 3]:
+        """Return the velocity of a flow that moves as a whole, mm/s: 0 unless it explains most of the film."""
+        velocity = common_velocity(self.average, self.box.spacing, self.transport.intervals.tolist())
+        squares = []
+        for uniform in (0 * velocity, velocity):
+            residual = self.residual([self.box.uniform(uniform)] * len(self.average))
+            squares.append(float(residual[self.transport.core].square().mean()) - 1)  # beyond the noise
+        return velocity if squares[1] < MOST * squares[0] else 0 * velocity
 
     def spectra(self, controls: Tensor) -> list[Tensor]:
         """Return the spectra of the velocity at all instants."""
         vorticity = self.prior.vorticity(controls).unbind()  # unbound, derivatives of slices stay small
         start, *changes = (self.box.velocity(w) for w in vorticity)
-        return self.equations.solve(start, self.extended, self.transport.intervals.tolist(), changes)
+        mean = self.prior.mean(controls)
+        return self.equations.solve(start, self.extended, self.transport.intervals.tolist(), changes, mean)
 
     @torch.no_grad()
     def weigh(self, controls: Tensor) -> None:
@@ -115,24 +131,39 @@ class Problem:
         return Sample(residual / self.transport.deviation, controls)
 
     @torch.no_grad()
-    def flow(self, controls: Tensor) -> Flow:
+    def flow(self, controls: Tensor, falling: bool = False) -> Flow:
         """Return the flow of controls, on the grid of the velocity."""
         box, intervals = self.box, self.transport.intervals[:, None, None, None]
         spectra = self.spectra(controls)
         residual = self.residual(spectra)
         misfit = float(residual[self.transport.core].square().mean().sqrt())
-        pressure = momentum = None
+        pressure = momentum = unexplained = None
         if self.settings.physics != "transport":
             forcing = self.prior.vorticity(controls)[1:] * (1 - box.margins())  # there it stands for the flow outside
             change = torch.stack([box.inside(box.values(box.velocity(w))) for w in forcing])
             momentum = change / intervals[:, None]
+            unexplained = self._unexplained(momentum, spectra)
             pressure = self.pressure(spectra)
         region = self.transport.region
         determined = torch.cat([region[:1], region[1:] | region[:-1], region[-1:]])
         return Flow(
             box.grid, torch.stack([box.inside(box.values(u)) for u in spectra]), pressure,
-            residual * self.transport.deviation / intervals, momentum, determined, misfit,
+            residual * self.transport.deviation / intervals, momentum, determined, misfit, unexplained,
+            falling=falling,
         )  # fmt: skip
+
+    def _unexplained(self, momentum: Tensor, spectra: list[Tensor]) -> float:
+        """Return the rms of the acceleration that the equations do not explain over that of the fluid."""
+        box, squares = self.box, [0.0, 0.0]
+        for seconds, part, region, a, b in zip(
+            self.transport.intervals.tolist(), momentum, self.transport.region, spectra[:-1], spectra[1:], strict=True
+        ):
+            u = box.values(0.5 * (a + b))
+            advection = torch.stack([(u * box.gradient(component)).sum(dim=0) for component in 0.5 * (a + b)])
+            acceleration = box.inside(box.values(b - a) / seconds + advection)
+            for k, vectors in enumerate((part, acceleration)):
+                squares[k] += float(vectors[:, region].square().sum())
+        return math.sqrt(squares[0] / squares[1]) if squares[1] > 0 else 0.0
 
     def pressure(self, spectra: list[Tensor]) -> Tensor:
         """Return the pressure at the instants, mm^2/s^2, of mean 0 in the box."""
@@ -143,8 +174,10 @@ class Problem:
 def minimise(
     problem: Problem, controls: Tensor, max_iterations: int, before: int, limit: float,
     report: Callable[[float, Tensor, int], float], noise: Sample | None = None, enough: float = 0.0,
-) -> tuple[Tensor, int]:  # fmt: skip
-    """Return the best controls, and the number of evaluations, until a limit or a residual small enough.
+) -> tuple[Tensor, int, bool]:  # fmt: skip
+    """Return the best controls, the number of evaluations, and whether the objective was still falling at the end.
+
+    It ends at a limit, or at a residual small enough.
 
     Parameters
     ----------
@@ -159,10 +192,11 @@ def minimise(
         [x], max_iter=max_iterations, max_eval=10 * max_iterations, history_size=HISTORY,
         tolerance_grad=0, tolerance_change=0, line_search_fn="strong_wolfe",
     )  # fmt: skip
-    best, lowest, done = controls, math.inf, before
+    best, lowest, done, falling = controls, math.inf, before, True
+    recent: deque[float] = deque(maxlen=RECENT)
 
     def closure() -> Tensor:
-        nonlocal best, lowest, done
+        nonlocal best, lowest, done, falling
         optimiser.zero_grad()
         z = prior.controls(x)
         loss, misfit = problem.loss(z, noise)
@@ -170,6 +204,8 @@ def minimise(
         done += 1
         if loss.item() < lowest:
             best, lowest = z.detach(), loss.item()
+        recent.append(lowest)
+        falling = misfit >= enough and (len(recent) < RECENT or lowest < (1 - FALLING) * recent[0])
         if report(misfit, best, done) > limit or misfit < enough:
             raise _End
         return loss
@@ -180,7 +216,7 @@ def minimise(
         raise InputError(
             "the residual of the first velocity is not a number; expected densities that are", field="film"
         )
-    return best, done
+    return best, done, falling
 
 
 def resampled(

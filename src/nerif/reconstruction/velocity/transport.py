@@ -25,6 +25,7 @@ from nerif.reconstruction.velocity.resampling import along_axes, averages, inter
 __all__ = ["Path", "Transport"]
 
 LEAST = 0.01  # of the largest theta: below, nothing visible is carried
+VISIBLE = 2.0  # standard deviations of the noise: below, the scalar is not visible
 STRONG = 0.05  # of the largest theta
 REACH = 5  # voxels around the scalar at which the residual is evaluated
 MODEL_ERROR = 0.03  # of the local change of theta per interval, that velocities on a grid leave
@@ -82,7 +83,9 @@ class Transport:
             self.places.append(place)
             self.points.append(centres[place])
             self.gains.append(gain[k].reshape(-1)[place])
-        strong = self.coarse(theta).abs() > STRONG * largest
+        strength = self.coarse(theta).abs()
+        self._carried = smooth(strength, (1.0, 1.0, 1.0)) > max(LEAST * largest, VISIBLE * noise)
+        strong = strength > STRONG * largest
         self.core = strong[1:] | strong[:-1]
         """Voxels of the velocity in which much of the scalar is, of each interval: those of the misfit."""
         self.change, self._largest = theta[1:] - theta[:-1], largest
@@ -131,11 +134,8 @@ class Transport:
 
     @cached_property
     def region(self) -> Bool[Tensor, "t z y x"]:
-        """Voxels of the velocity in which the scalar is carried, of each interval."""
-        masks = torch.zeros(len(self.intervals), self.grid.shape[0] * self.grid.shape[1] * self.grid.shape[2])
-        for mask, place in zip(masks, self.places, strict=True):
-            mask[place] = 1
-        return self.coarse(masks.reshape(-1, *self.grid.shape)) > 0.5
+        """Voxels of the velocity in which the scalar is carried, of each interval: it is there, above its noise."""
+        return self._carried[1:] | self._carried[:-1]
 
     def residual(self, splines: Float[Tensor, "t 3 zp yp xp"]) -> Float[Tensor, "t z y x"]:
         """Return the residual of every interval.
