@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
 import nerif
+from nerif.imaging.calibration.cameras_file import CalibratedCamera
 from refusals import refused
 
 
@@ -28,6 +31,39 @@ def test_each_is_one_line_of_text(measurement, result, ball, box):
         assert all(word in text for word in words), text
     masked = nerif.Volume(torch.full((2, 2, 2), torch.nan), nerif.Grid(box, (2, 2, 2)))
     assert "masked everywhere" in repr(masked)
+
+
+def test_arrays_and_lists_become_tensors_and_other_things_are_refused_by_name(measurement, result, box, tmp_path):
+    camera, array = measurement.cameras[0], np.asarray
+    names = ("intrinsics", "rotation", "translation", "distortion")
+    plane = nerif.Plane(array(camera.background.normal), camera.background.offset)
+    other = replace(camera, background=plane, **{name: getattr(camera, name).tolist() for name in names})
+    assert all(torch.equal(getattr(other, name), getattr(camera, name)) for name in names)
+    again = replace(measurement, displacement=array(measurement.displacement), sigma=array(measurement.sigma))
+    assert torch.equal(again.displacement, measurement.displacement)
+    grid = nerif.Grid(box, (2, 3, 4))
+    assert nerif.Volume(np.ones((2, 3, 4)), grid).values.dtype == torch.float32
+    with refused("values"):
+        nerif.Volume("field", grid)
+    calibrated = tuple(CalibratedCamera.from_camera(c) for c in measurement.cameras)
+    with refused("cameras"):
+        replace(measurement, cameras=calibrated)
+    for name in ("x.mat", "x.vti", "x"):
+        with refused(tmp_path / name):
+            measurement.write(tmp_path / name)
+    with refused("grid"):
+        result.volume(nerif.Grid(nerif.Box((0.0, 0.0, 0.0), tuple(2 * v for v in box.upper)), (4, 4, 4)))
+    for field, value in (("pressure_pa", 1.013), ("wavelength_nm", 0.532)):
+        with refused(field):
+            nerif.GasSettings(**{field: value})
+
+
+def test_single_voxels_are_not_the_range_that_is_shown(box):
+    values = torch.full((20, 20, 20), 1600.0)
+    values[0, 0, :4] = torch.tensor([3334.0, 150.0, 3000.0, 250.0])
+    volume = nerif.Volume(values, nerif.Grid(box, (20, 20, 20)), "temperature", "K")
+    for text in (repr(volume), dict(volume.summary())["Temperature"]):
+        assert "1600 to 1600 K (0.1 to 99.9 %" in text
 
 
 def test_views_by_name(measurement):

@@ -146,7 +146,7 @@ def test_a_volume_shows_its_slices(ball: Field, box: Box):
     masked = torch.full(grid.shape, torch.nan)
     masked[2:] = 300.0
     cells = Panel(Volume(masked, grid, "temperature", "K")._repr_html_()).cells
-    assert cells[cells.index("Temperature") + 1] == "300 to 300 K; 12.50% masked"
+    assert cells[cells.index("Temperature") + 1] == "300 to 300 K (0.1 to 99.9 % of the voxels); 12.50% masked"
 
 
 def test_a_reconstruction_shows_its_field_and_why_it_stopped(measurement: Measurement):

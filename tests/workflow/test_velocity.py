@@ -96,8 +96,8 @@ def test_the_ring_is_found_to_rise_and_the_ambient_is_unknown(velocity: Path):
         ({"misfit": 2.0, "falling": True}, "Use with care", "more time"),
         ({"misfit": 1.1, "falling": True}, "Use with care", "while its residual still fell"),
         ({"misfit": 3.2}, "Do not use", "3.2 times"),
-        ({"unexplained": 0.1}, "Use with care", "leaves 10% of the acceleration"),
-        ({"unexplained": 0.8}, "Do not use", "leaves 80% of the acceleration"),
+        ({"unexplained": 0.015}, "Use with care", "leaves 1.5% of the acceleration"),
+        ({"unexplained": 0.8}, "Do not use", "leaves 80.0% of the acceleration"),
         ({"settings": {"samples": 6}}, "Use with care", "no time for standard deviations"),
         ({"physics": "transport"}, "Use with care", "no pressure"),
         ({"known": 0.03}, "Use with care", "known in 3.0% of the box"),
@@ -106,7 +106,7 @@ def test_the_ring_is_found_to_rise_and_the_ambient_is_unknown(velocity: Path):
 )
 def test_the_verdict_judges_residuals_limits_and_the_share_known(tmp_path: Path, about: dict, rating: str, words: str):
     share = about.pop("known", 0.4)
-    store = VelocitySequence.begin(tmp_path / "v.zarr", (0.0,), GRID, (), {"misfit": 1.1, "unexplained": 0.01} | about)
+    store = VelocitySequence.begin(tmp_path / "v.zarr", (0.0,), GRID, (), {"misfit": 1.1, "unexplained": 0.004} | about)
     u = torch.full(GRID.shape, math.nan)
     u.view(-1)[: round(share * u.numel())] = 1.0
     store.write_frame(0, {"u": u, "v": u, "w": u})

@@ -13,7 +13,7 @@ from nerif.data.velocity_sequence import COMPONENTS, VelocitySequence
 __all__ = ["MOST_MISFIT", "known_share", "relative_deviation", "velocity_verdict"]
 
 MISFIT = 1.5, 3.0  # rms of residual / sigma: above, with care; above, not to be used
-UNEXPLAINED = 0.05, 0.2  # acceleration that the equation of momentum leaves; of a simulated plume 0.004
+UNEXPLAINED = 0.01, 0.1  # acceleration that momentum leaves: of a plume 0.004, of wrinkles that are no flow 0.015
 DEVIATION = 0.2, 0.5  # standard deviation of the velocity over its rms
 KNOWN = 0.05, 0.01  # share of the box: below, with care; below, not to be used
 MOST_MISFIT = MISFIT[1]
@@ -31,7 +31,7 @@ def velocity_verdict(store: VelocitySequence) -> Verdict:
     reasons = [changes + check * (misfit > MISFIT[0])]
     if unexplained is not None:
         level.append(sum(unexplained > limit for limit in UNEXPLAINED))
-        reasons.append(f"the equation of momentum leaves {unexplained:.0%} of the acceleration unexplained")
+        reasons.append(f"the equation of momentum leaves {unexplained:.1%} of the acceleration unexplained")
     if spread is not None:
         level.append(sum(spread > limit for limit in DEVIATION))
         size = f"the standard deviation of the velocity is {spread:.0%} of its rms"

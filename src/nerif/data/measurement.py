@@ -8,14 +8,17 @@ import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from nerif.common.arrays import make_tensors
 from nerif.common.axis_order import order_remedy
 from nerif.common.conventions import DEFAULT_AMBIENT_FACES, InputError, ambient_index, parse_faces, unit_shown
+from nerif.common.files import ending
 from nerif.common.netcdf import opened, write_dataset
 from nerif.data.kinds import MEASUREMENT, reading_as
 from nerif.forward.base import ForwardModel
@@ -185,6 +188,15 @@ class Measurement:
     ambient_region: Region | None = None
 
     def __post_init__(self) -> None:
+        make_tensors(self, torch.float32, "displacement", "sigma")
+        make_tensors(self, torch.bool, *MASKS)
+        object.__setattr__(self, "maps", {name: torch.as_tensor(value) for name, value in self.maps.items()})
+        for camera in self.cameras:
+            if not isinstance(camera, Camera):
+                raise InputError(
+                    f"expected records of Camera, got {type(camera).__name__}; its method camera() returns one",
+                    field="cameras",
+                )
         self._check_maps()
         self._check_views()
         ambient_index(self.n_ambient)
@@ -532,6 +544,8 @@ class Measurement:
         """Write the file of docs/formats.md, atomically."""
         from nerif.data.measurement_file import encoding
 
+        if ending(path) != ".nc":
+            raise InputError(f"expected a name ending in .nc (NetCDF), got '{Path(path).name}'", field=path)
         dataset = self.to_dataset()
         write_dataset(path, dataset, encoding(dataset))
 

@@ -8,9 +8,11 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from nerif.common.arrays import make_tensors
 from nerif.common.axis_order import order_remedy
 from nerif.common.conventions import STATISTICS, InputError, ambient_index
 from nerif.geometry import Grid
@@ -95,6 +97,7 @@ class Volume:
     notes: dict[str, float | str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        make_tensors(self, torch.float32, "values")
         if tuple(self.values.shape) != self.grid.shape:
             remedy = order_remedy("values", "zyx", self.grid.shape, self.values.shape)
             raise InputError(
@@ -159,7 +162,8 @@ class Volume:
         title, values = describe(self.quantity)[1], np.asarray(self)
         finite = values[np.isfinite(values)]
         unit = "" if self.unit == "1" else f" {self.unit}"
-        limits = f"{finite.min():.4g} to {finite.max():.4g}{unit}" if finite.size else "masked everywhere"
+        ends = np.quantile(finite, [0.001, 0.999]) if finite.size else ()  # without single voxels
+        limits = f"{ends[0]:.4g} to {ends[1]:.4g}{unit} (0.1 to 99.9 %)" if finite.size else "masked everywhere"
         shape, (x, y, z) = " x ".join(map(str, self.grid.shape)), self.grid.box.edges
         return f"<Volume {self.quantity}: {title}, {limits}; {shape} voxels (z, y, x), {x:g} x {y:g} x {z:g} mm>"
 

@@ -19,7 +19,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerif.common.arrays import Matrix3, Pixels, Points, Values
+from nerif.common.arrays import Matrix3, Pixels, Points, Values, make_tensors
 from nerif.common.conventions import LARGEST_LENGTH, InputError, check_name
 from nerif.geometry.distortion import UPRIGHT, Array, from_sensor, to_sensor
 from nerif.geometry.lens import Lens, LensDiscs
@@ -159,6 +159,9 @@ class Plane:
     normal: Float[Tensor, 3]
     offset: float
 
+    def __post_init__(self) -> None:
+        make_tensors(self, torch.float64, "normal")
+
 
 @dataclass(frozen=True)
 class Camera:
@@ -198,6 +201,8 @@ class Camera:
                 raise InputError(f"expected {expected}, got {got}{remedy}", field=f"{name} of view '{self.name}'")
 
         check_name(self.name, "view")
+        arrays = ("intrinsics", "rotation", "translation", "distortion", "pose_sigma", "tilt")
+        make_tensors(self, torch.float64, *arrays)
         plane, lens, kind, k, r = self.background, self.lens, self.projection, self.intrinsics, self.rotation
         for name, value, limit, unit in (
             ("intrinsics", k, 1e7, " px"),

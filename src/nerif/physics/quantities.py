@@ -29,6 +29,7 @@ __all__ = ["NOT_UNIFORM", "GasChanges", "GasSettings", "derive", "derive_all", "
 
 TEMPERATURE_RANGE = 200.0, 4000.0
 """K; outside, gases of the table condense or dissociate."""
+LEAST_PRESSURE, LEAST_WAVELENGTH = 100.0, 100.0  # Pa and nm; smaller ones are in bar and µm
 AMBIENT_RANGE = 200.0, 2000.0  # K, of the gas around a flow
 HOTTEST = 2300.0  # K, of flames in air; helium in air appears as air of 2400 K
 PRODUCTS = "H2O", "CO2"  # a composition without them is not that of a flame
@@ -64,6 +65,14 @@ class GasSettings:
     def __post_init__(self) -> None:
         if not 0 < self.pressure_pa < math.inf:
             raise InputError(f"expected a positive pressure in Pa, got {self.pressure_pa}", field="pressure_pa")
+        if self.pressure_pa < LEAST_PRESSURE:
+            raise InputError(
+                f"expected Pa such as 101325, got {self.pressure_pa:g}; 1 bar are 100000 Pa", field="pressure_pa"
+            )
+        if self.wavelength_nm < LEAST_WAVELENGTH:
+            raise InputError(
+                f"expected nanometres such as 532, got {self.wavelength_nm:g}; 1 µm are 1000 nm", field="wavelength_nm"
+            )
 
     def for_measurement(self, measurement: Measurement) -> GasSettings:
         """Return the settings at the wavelength of a measurement, if it has one, and refuse invalid ones."""

@@ -47,14 +47,14 @@ def number(value: object, digits: int = 4) -> str:
 
 
 def span(values: Float[np.ndarray, ...], unit: str = "1", digits: int = 3) -> str:
-    """Return lowest and highest value with their unit, and the masked fraction (NaN)."""
+    """Return the values below and above which a thousandth is, with their unit, and the masked fraction (NaN)."""
     finite = values[np.isfinite(values)]
     if not finite.size:
         return "masked everywhere"
     share = 1 - finite.size / values.size
     masked = f"; {percent(share, 2)} masked" if share else ""
-    low, high = (number(float(x), digits) for x in (finite.min(), finite.max()))
-    return f"{with_unit(f'{low} to {high}', unit)}{masked}"
+    low, high = (number(float(x), digits) for x in np.quantile(finite, [0.001, 0.999]))
+    return f"{with_unit(f'{low} to {high}', unit)} (0.1 to 99.9 % of the voxels){masked}"
 
 
 def panel(title: str, rows: Sequence[tuple[str, str]], *images: tuple[str, str]) -> str:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from torch import Tensor
 
+from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
 from nerif.data.volume import Volume, describe, name_of
 from nerif.fields.base import Field
@@ -163,6 +164,11 @@ class Reconstruction:
         Voxels whose centre is within a body are NaN.
         """
         grid = grid if isinstance(grid, Grid) else Grid.of_resolution(self.box, grid)
+        if not self.box.holds(grid.box):
+            raise InputError(
+                f"expected a part of the box {self.box.lower} to {self.box.upper} mm, got {grid.box.lower} to "
+                f"{grid.box.upper}", field="grid",
+            )  # fmt: skip
         return sampled(self.field, grid, self.quantity, self.n_ambient, self.bodies, self.device)
 
     def to_xarray(self, grid: Grid | int = VOXELS) -> xr.DataArray:

@@ -247,8 +247,9 @@ class WriteSurface(PipelineStep):
         for name, values in surface.quantities.items():
             present = values[values.isfinite()]
             if len(present):
-                ends = f"{float(present.min()):.4g} to {float(present.max()):.4g}"
-                job.monitor.say(f"surface of the bodies: {name} {ends} {unit_shown(describe(name)[0])}".rstrip())
+                low, high = present.double().quantile(torch.tensor([0.001, 0.999], dtype=torch.float64)).tolist()
+                unit = unit_shown(describe(name)[0])
+                job.monitor.say(f"surface of the bodies: {name} {low:.4g} to {high:.4g} {unit} (0.1 to 99.9 %)")
 
 
 class WriteRig(PipelineStep):
