@@ -17,6 +17,7 @@ from nerif.analysis.consistency import (
     compare,
     fit,
     image_remarks,
+    independent_samples,
     of_one_view,
     open_faces,
     orders,
@@ -26,6 +27,7 @@ from nerif.analysis.consistency import (
     unrelated_finding,
     without_spikes,
 )
+from nerif.analysis.image_edges import cut_edges
 from nerif.analysis.remedies import CAUSES, advice
 from nerif.cli.cli import main
 from nerif.data.measurement import Measurement
@@ -145,6 +147,11 @@ def test_a_flame_that_ends_at_the_box_has_no_open_face(blur):
     assert open_faces(fit(m, 24, 3e-3)[0], m) == []
 
 
+def test_a_plume_that_ends_at_the_box_has_no_open_face():
+    m = square(phantom="plume", views=6, image_size=(30, 30), pixel_pitch=0.13, noise=0.02)
+    assert open_faces(fit(m, 20)[0], m, 20) == []
+
+
 @pytest.fixture(scope="module")
 def tall() -> Measurement:
     """A flame twice as tall as the box it is reconstructed in."""
@@ -162,6 +169,34 @@ def test_open_faces_show_in_the_rays_through_them(tall):
 def test_open_faces_are_findings(tall):
     found = check_consistency(tall, voxels=20)
     assert [f.sentence.split(":")[0] for f in found.findings] == ["face z-", "face z+"]
+
+
+# -- images of a part of the flow ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("phantom", ["flame", "plume", "gaussian-jet", "fire"])
+@pytest.mark.parametrize("views", [1, 3, 6])
+@pytest.mark.parametrize(("pitch", "sides"), [(0.04, {"left", "right"}), (0.2, set())])
+def test_edges_that_cut_the_flow(phantom, views, pitch, sides):
+    m = square(phantom=phantom, views=views, image_size=(20, 20), pixel_pitch=pitch, noise=0.02)
+    edges = cut_edges(m, m.observations[0])
+    assert {edge.side for edge in edges} == sides
+    assert {edge.view for edge in edges} == (set(range(views)) if sides else set())
+
+
+def test_a_shaken_camera_or_noise_cuts_nothing(small):
+    noise = torch.randn(small.displacement.shape, generator=torch.Generator().manual_seed(0))
+    for values in (small.displacement + torch.tensor([1.5, -0.7]), noise, torch.zeros_like(noise)):
+        m = replace(small, displacement=values)
+        assert cut_edges(m, m.observations[0]) == []
+
+
+@pytest.mark.parametrize(("phantom", "views"), [("flame", 3), ("fire", 4)])
+def test_views_of_a_part_of_the_flow_accuse_nothing(phantom, views):
+    m = square(phantom=phantom, views=views, image_size=(20, 20), pixel_pitch=0.04, noise=0.02)
+    found = check_consistency(m, voxels=COARSE)
+    assert (found.findings, found.corrections) == ((), {})
+    assert found.remarks[0].startswith("the images show only 6% of the box, and the displacement does not fall to zero")
 
 
 # -- the maps by themselves ---------------------------------------------------------------------------------------
@@ -234,6 +269,29 @@ def test_binning_keeps_rays_and_displacements():
         assert torch.allclose(a.intrinsics, b.intrinsics)
     error = (small.displacement - coarse.displacement).square().mean().sqrt()
     assert float(error) < 0.05 * float(coarse.displacement.square().mean().sqrt())
+
+
+# -- chance -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("channels", [1, 2])
+@pytest.mark.parametrize("width", [0.0, 1.0, 2.0])
+def test_independent_samples_of_noise(channels, width):
+    """Of noise blurred by a Gaussian, an area of 2 pi width^2 has one."""
+    counts = []
+    for seed in range(4):
+        noise = torch.randn(60, 70, channels, generator=torch.Generator().manual_seed(seed)).numpy()
+        counts.append(independent_samples(torch.from_numpy(gaussian_filter(noise, (width, width, 0)))))
+    assert sum(counts) / 4 == pytest.approx(60 * 70 / max(1.0, 2 * torch.pi * width**2), rel=0.25)
+
+
+def test_no_correction_is_a_matter_of_chance(small):
+    """Of images of noise, the best of all hypotheses gains, but not more than chance gives."""
+    m = small.select(small.names[:3])
+    noise = torch.randn(m.displacement.shape, generator=torch.Generator().manual_seed(0)).numpy()
+    noise = torch.from_numpy(gaussian_filter(noise, (0, 2, 2, 0)))
+    noise[:, [0, 1, 2, -3, -2, -1]], noise[:, :, [0, 1, 2, -3, -2, -1]] = 0.0, 0.0
+    assert not check_consistency(replace(m, displacement=noise), voxels=8).corrections
 
 
 # -- corrections --------------------------------------------------------------------------------------------------

@@ -208,6 +208,49 @@ def test_a_fit_that_the_time_limit_cut_short(seconds, outcome, trials, word):
     assert ("of the time limit of 60 s" in found.reasons) == (outcome == "time_limit")
 
 
+@pytest.mark.parametrize(("share", "word"), [(0.64, "cannot tell"), (0.3, "use")])  # CC 0.77 and 0.95
+def test_a_view_that_the_first_run_does_not_predict_gives_no_estimate(share, word):
+    first = first_run(share, 0.6)
+    result = judged(views=views_of(0.02), cross_validation=first)
+    assert result.rating == word
+    assert (result.error is None) == (word == "cannot tell")
+    assert word == "use" or "more --max-steps makes it longer" in result.reasons
+
+
+@pytest.mark.parametrize("settings", [{}, {"symmetry": "axis"}, {"symmetry": "planar"}])
+@pytest.mark.parametrize("names", ["a", "abcde"])
+def test_a_field_that_explains_little_names_the_next_command(settings, names):
+    reasons = judged(settings, views=views_of(0.9, names)).reasons
+    assert ("--symmetry axis" in reasons) == (names == "a" and not settings)
+    assert ("nerif check" in reasons) == (names != "a")
+
+
+@pytest.mark.parametrize("outcome", ["steps", "time_limit", "converged"])
+@pytest.mark.parametrize("cause", ["blur", "scale", ""])
+@pytest.mark.parametrize("ratio", [1.2, 2.0])
+def test_residuals_near_the_noise_before_convergence_need_more_steps(outcome, cause, ratio):
+    test = {**WHITE, **CORRELATED, "cause": cause}
+    views = [noisy(n, 0.02 * ratio, residual_test=test if n == "a" or cause else WHITE) for n in "abcdef"]
+    reasons = judged(views=views, cross_validation=first_run(0.05), outcome=outcome).reasons
+    assert "spatially correlated" in reasons
+    only = outcome != "converged" and ratio < 1.5
+    assert ("not yet learned" in reasons) == (outcome != "converged")
+    assert any(word in reasons for word in ("sharpness", "wrong scale", "nerif check")) != only
+
+
+@pytest.mark.parametrize(("names", "symmetry"), [("a", "axis"), ("abcde", "")])
+@pytest.mark.parametrize("rms", [0.02, 0.6, 0.9])
+def test_a_flow_wider_than_the_images_is_the_cause(names, symmetry, rms):
+    views = views_of(rms, names, residual_test={**WHITE, **CORRELATED, "cause": "scale"})
+    views[-1] |= {"cut_edge": "left", "cut_signal": 0.8}
+    result = judged({"symmetry": symmetry}, views=views, cross_validation=first_run(0.1))
+    assert result.rating == ("cannot tell" if rms < 0.1 else "do not use")
+    assert "displacement does not fall to zero at the edge of the view" in result.reasons
+    assert "--open-faces" in result.reasons
+    assert "--known" in result.reasons
+    assert "wrong scale" not in result.reasons
+
+
 AXIS = {"kind": "axis", "harmonics": 0}
 ASYMMETRY = {"name": "a", "antisymmetry": 0.5, "cc": {"u": 0.4, "v": 0.6}}
 

@@ -2,10 +2,12 @@
 
 For each technique: the maps are binned and inspected by themselves (`image_remarks`). Each view is predicted by a
 quick reconstruction from the others (`predicted_by_others`). Common mistakes (swapped components, signs, mirrored or
-exchanged images: `Correction`) are undone one at a time; the one whose correction clearly improves a joint fit is
-reported, then the next is searched. If no view is predicted by the others, common errors of whole calibrations
-(geometry/plausibility.py) are tried instead (`unrelated_finding`). Last, rays through each face of the box show whether
-the flow extends beyond it (`open_faces`). `corrected` applies the corrections.
+exchanged images: `Correction`) are undone one at a time; the one whose correction clearly improves a joint fit, by more
+than chance gives over all hypotheses tried, is reported, then the next is searched. If no view is predicted by the
+others, common errors of whole calibrations (geometry/plausibility.py) are tried instead (`unrelated_finding`). Last,
+rays through each face of the box show whether the flow extends beyond it (`open_faces`). Where the images show only a
+part of the flow (image_edges.py), nothing is corrected and no single view is accused. `corrected` applies the
+corrections.
 
 A mistake that fits as well as the truth cannot be detected: all signs flipped, or a mirrored image of a symmetric flow.
 """
@@ -14,6 +16,7 @@ from __future__ import annotations
 
 import math
 import re
+import statistics
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -22,6 +25,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from nerif.analysis.image_edges import cut_edges, cut_sentence
 from nerif.analysis.prediction import predict_view
 from nerif.common.blocks import blocks
 from nerif.common.conventions import FACES, InputError
@@ -41,8 +45,8 @@ from nerif.reconstruction.voxels.tikhonov import Tikhonov
 
 __all__ = [
     "Change", "Consistency", "Correction", "ViewAgreement", "binned", "check_consistency", "compare", "corrected",
-    "everywhere", "fit", "image_remarks", "of_one_view", "open_faces", "orders", "predicted_by_others", "repeatability",
-    "unrelated", "unrelated_finding", "without_spikes",
+    "everywhere", "fit", "image_remarks", "independent_samples", "of_one_view", "open_faces", "orders",
+    "predicted_by_others", "repeatability", "unrelated", "unrelated_finding", "without_spikes",
 ]  # fmt: skip
 
 MAX_PIXELS = 48  # along the longer edge of the images that are compared
@@ -55,6 +59,7 @@ MAX_EXCHANGED, MAX_EXCHANGED_LAST = 1.15, 1.03  # disagreement of two views, exc
 # fit, and at last, predicted without both
 FEW_VIEWS, MAX_OBJECTIVE_FEW, MAX_EXCHANGED_FEW = 9, 0.9, 0.95  # of fewer views, neighbours are further apart: an
 # exchange needs more evidence, in the joint fit and predicted without both
+CHANCE = 0.05  # probability of a correction by chance, over all hypotheses tried
 DISAGREES = 0.5  # agreement of a view over the median, below which it is reported
 WRONG_GAIN = 1.6  # factor of the values of a view
 
@@ -68,6 +73,7 @@ OPEN_FACE = (0.4, 2.0)  # the unexplained rms of rays through an open face over 
 # of their own signal over that share of other rays; rays through an end face cross a corner of the box and carry little
 # signal, of which a flow that ends at the box leaves a large share unexplained, but little in all
 MIN_RAYS = 20
+GROWN, MAX_GROWN = 0.2, 0.6  # a box larger by this, over its longest edge, leaves at most this of what is unexplained
 
 
 @dataclass(frozen=True)
@@ -164,13 +170,16 @@ def _check_technique(
     small = uncorrected = without_spikes(binned(measurement, MAX_PIXELS))
     valid = measurement.valid_share(measurement.observations[0])
     remarks = image_remarks(measurement, small, valid)
+    if cut := cut_edges(small, small.observations[0]):
+        remarks.insert(0, cut_sentence(small, small.observations[0], cut))
     if len(names) < 3:
         cannot = "fewer than three views: from one instant the check cannot tell whether they show the same flow"
         return Consistency((), (), (*remarks, cannot))
     corrections: list[Correction] = []
     for _ in range(max(1, len(names) // 2)):
-        correction = _most_likely_mistake(small, voxels, on_step)
+        correction, doubt = _most_likely_mistake(small, voxels, on_step)
         if correction is None:
+            remarks += [doubt] if doubt else []
             break
         corrections.append(correction)
         small = _undone(correction, small)
@@ -179,7 +188,7 @@ def _check_technique(
         nothing = f"every {kind.measured} of rays through the box is 0: nothing to compare"
         return Consistency((), (), (*remarks, nothing))
     compared = _compared(small, voxels)
-    if unrelated([agreement for agreement, _ in compared], small):
+    if unrelated([agreement for agreement, _ in compared], small) and (not cut or suspicious):
         compared = _compared(uncorrected, voxels) if corrections else compared
         numbers = [i for i, name in enumerate(names) if name in suspicious]
         finding = unrelated_finding(uncorrected, [agreement for agreement, _ in compared], voxels, numbers, on_step)
@@ -197,24 +206,27 @@ def _check_technique(
     for i, (agreement, gain) in enumerate(compared):
         mistakes = [c for c in corrections if i in c.views and len(c.views) < len(names)]
         verdict, code = "; ".join(c.words for c in mistakes), ""
-        if not mistakes and agreement < DISAGREES * median and median > 0.3 and len(names) > 4:
+        if mistakes or cut:  # what lies outside an image deflects the rays of others
+            pass
+        elif agreement < DISAGREES * median and median > 0.3 and len(names) > 4:
             verdict = "does not agree with the other views: wrong calibration, other flow, or other time?"
             code = "unlike"
-        elif not mistakes and i == extreme and not 1 / WRONG_GAIN < gain < WRONG_GAIN and agreement > 0.5:
+        elif i == extreme and not 1 / WRONG_GAIN < gain < WRONG_GAIN and agreement > 0.5:
             verdict = f"{kind.measured} {gain:.2g} times that predicted by the other views: {kind.misscaled}?"
             code = "misscaled"
         if code:
             findings.append(Finding(code, f"view {names[i]}: {verdict}", (names[i],)))
         views.append(ViewAgreement(names[i], valid[i], agreement, gain, verdict, kind.measured))
-    if not any(v.verdict for v in views) or corrections:  # a wrong view has rays through every face
-        findings += open_faces(joint, small)
+    if not cut and (corrections or not any(v.verdict for v in views)):  # a wrong view has rays through every face
+        findings += open_faces(joint, small, voxels)
     if kind.quantity == INDEX:
         mean = float(joint.sample(Grid.of_resolution(small.box, voxels)).mean())
         gas = "lighter (hot gas, helium)" if mean < 0 else "denser (cold or heavy gas)"
         remarks.append(f"the flow is {gas} than the ambient; if this is wrong, all signs are flipped")
     return Consistency(
-        tuple(views), tuple(findings), tuple(remarks), {kind.name: tuple(corrections)} if corrections else {}
-    )
+        tuple(views), tuple(findings), tuple(remarks),
+        {kind.name: tuple(corrections)} if corrections and not cut else {},
+    )  # fmt: skip
 
 
 # -- binned maps, and what they show by themselves ----------------------------------------------------------------
@@ -341,6 +353,12 @@ def _path_integral(small: Measurement) -> PathIntegral:
     return PathIntegral(forward_model(small.observations[0].technique, small))
 
 
+def _predicted(field: Field, small: Measurement) -> dict[int, Float[Tensor, "row column c"]]:
+    """The prediction of every view."""
+    model = _path_integral(small)
+    return {i: predict_view(field, camera, model, small.box) for i, camera in enumerate(small.cameras)}
+
+
 def predicted_by_others(
     small: Measurement, withheld: Sequence[int], voxels: int
 ) -> dict[int, Float[Tensor, "row column c"]]:
@@ -456,6 +474,7 @@ class Correction:
     words : description of the mistake
     change : transform of each of these views; None where images are exchanged
     order : index of the image of each of these views, where images are exchanged
+    evidence : the agreement gained
     """
 
     views: tuple[int, ...]
@@ -463,6 +482,7 @@ class Correction:
     words: str
     change: Transform | None
     order: tuple[int, ...] = ()
+    evidence: str = ""
 
     def undo(self, d: Tensor, cameras: Sequence[Camera]) -> Tensor:
         """Return corrected values (view, row, column, channel); each view has its own size."""
@@ -482,7 +502,8 @@ def _undone(correction: Correction, small: Measurement) -> Measurement:
 
 def _finding(correction: Correction, names: Sequence[str]) -> Finding:
     views = tuple(names[i] for i in correction.views)
-    return Finding(correction.code, f"{Finding.subject(views, len(names))}: {correction.words}", views)
+    sentence = f"{Finding.subject(views, len(names))}: {correction.words} ({correction.evidence})"
+    return Finding(correction.code, sentence, views)
 
 
 def _changes(observation: Observation, cameras: Sequence[Camera]) -> list[Change]:
@@ -527,54 +548,105 @@ def orders(cameras: Sequence[Camera]) -> list[Correction]:
     ]  # fmt: skip
 
 
-def _most_likely_mistake(small: Measurement, voxels: int, on_step: Callable[[int, int], None]) -> Correction | None:
-    """The correction that improves the joint fit most, if it does so clearly."""
-    views = range(len(small.names))
+def _most_likely_mistake(
+    small: Measurement, voxels: int, on_step: Callable[[int, int], None]
+) -> tuple[Correction | None, str]:  # fmt: skip
+    """The correction that improves the joint fit most, if it does so clearly, and what cannot be told."""
+    views, doubt = range(len(small.names)), ""
     observation, d = small.observations[0], _values(small)
+    pairs = _exchanges(small.cameras)
     of_all, done = [*everywhere(observation, small.cameras), *orders(small.cameras)], 0
+    hypotheses = len(pairs) + len(of_all)
 
     def step(total: int) -> None:
         nonlocal done
         done += 1
         on_step(done, total)
 
-    shortlist, agreements, predictions = [], [], {}
+    shortlist, predictions = [], {}
     for i in views:
         predictions[i] = predicted = predicted_by_others(small, [i], voxels)[i]
         limit = MAX_DISAGREEMENT * _disagreement(predicted, small, i, d[i])
-        agreements.append(compare(predicted, small, i)[0])
-        shortlist += [
-            c for c in of_one_view(i, observation, small.cameras)
-            if _disagreement(predicted, small, i, c.undo(d, small.cameras)[i]) < limit
-        ]  # fmt: skip
+        changes = of_one_view(i, observation, small.cameras)
+        hypotheses += len(changes)
+        shortlist += [c for c in changes if _disagreement(predicted, small, i, c.undo(d, small.cameras)[i]) < limit]
         step(2 * len(views))
-    shortlist += [c for c in _exchanges(small.cameras) if _exchanged(predictions, small, c) < MAX_EXCHANGED]
-    _, uncorrected = fit(small, voxels, 1e-4)
+    shortlist += [c for c in pairs if _exchanged(predictions, small, c) < MAX_EXCHANGED]
+    joint, uncorrected = fit(small, voxels, 1e-4)
     if not uncorrected > 0:
-        return None
+        return None, ""
     results = []
     for correction in [*shortlist, *of_all]:
-        ratio = fit(_undone(correction, small), voxels, 1e-4)[1] / uncorrected
+        field, objective = fit(_undone(correction, small), voxels, 1e-4)
         limit = MAX_OBJECTIVE_EVERYWHERE if len(correction.views) == len(views) else MAX_OBJECTIVE
-        results.append((ratio / limit, ratio, correction))
+        results.append((objective / uncorrected / limit, objective / uncorrected, correction, field))
         step(len(views) + len(shortlist) + len(of_all))
-    min_agreement = DISAGREES * float(torch.tensor(agreements).median())
-    for over_limit, ratio, correction in sorted(results, key=lambda r: r[0]):
+    agreements = [compare(predictions[i], small, i)[0] for i in views]
+    for over_limit, ratio, correction, field in sorted(results, key=lambda r: r[0]):
         if over_limit > 1:
-            return None
-        if correction.change is None and len(correction.views) == 2:
-            few = len(views) < FEW_VIEWS
-            predicted_pair = predicted_by_others(small, correction.views, voxels)
-            last = _exchanged(predicted_pair, small, correction)
+            break
+        few, whole = len(views) < FEW_VIEWS, len(correction.views) == len(views)
+        if correction.change is None and not whole:
+            pair = predicted_by_others(small, correction.views, voxels)
+            last = _exchanged(pair, small, correction)
             if last > (MAX_EXCHANGED_FEW if few else MAX_EXCHANGED_LAST) or (few and ratio >= MAX_OBJECTIVE_FEW):
                 continue
-        if len(correction.views) == len(views):
-            return correction
         trial = _undone(correction, small)
-        corrected_pair = predicted_by_others(trial, correction.views, voxels)
-        if all(compare(corrected_pair[i], trial, i)[0] >= min_agreement for i in correction.views):
-            return correction
-    return None
+        after = {i: predicted_by_others(trial, [i], voxels)[i] for i in views}
+        corrected_agreements = [compare(after[i], trial, i)[0] for i in views]
+        least = DISAGREES * float(torch.tensor(agreements).median())
+        if min(corrected_agreements[i] for i in correction.views) < least:
+            continue
+        by_others = likelihood = _log_likelihood(predictions, small, after, trial)
+        if not whole:  # the other views hold the field
+            joint_fits = _predicted(joint, small), _predicted(field, trial)
+            likelihood = max(by_others, _log_likelihood(joint_fits[0], small, joint_fits[1], trial))
+        chance = min(1.0, hypotheses * math.exp(-likelihood)) if by_others > 0 else 1.0
+        evidence = (
+            f"agreement {statistics.fmean(corrected_agreements):.2f} instead of {statistics.fmean(agreements):.2f}; "
+            f"probability by chance, with {hypotheses} hypotheses tried, {max(chance, 1e-4):.2g}"
+        )
+        if chance < CHANCE:
+            return replace(correction, evidence=evidence), ""
+        subject = Finding.subject([small.names[i] for i in correction.views], len(views))
+        doubt = doubt or f"{subject}: cannot tell whether {correction.words} ({evidence})"
+    return None, doubt
+
+
+def _log_likelihood(
+    before: Mapping[int, Tensor], small: Measurement, after: Mapping[int, Tensor], trial: Measurement
+) -> float:  # fmt: skip
+    """The logarithm of the ratio of likelihoods of views after and before a change: sum n/2 log(D / D').
+
+    D is the disagreement of a view, n the number of independent samples of its residual after the change.
+    """
+    total = 0.0
+    for i in range(len(small.names)):
+        n = independent_samples(_residual(after[i], trial, i))
+        old, new = (_disagreement(p[i], m, i, _values(m)[i]) for p, m in ((before, small), (after, trial)))
+        total += 0.5 * n * math.log(max(old, 1e-6) / max(new, 1e-6))
+    return total
+
+
+def _residual(predicted: Float[Tensor, "row column c"], small: Measurement, view: int) -> Float[Tensor, "row column c"]:
+    """The residual of a view but for a factor of the prediction; 0 without a measurement."""
+    height, width = small.cameras[view].image_size
+    gain = compare(predicted, small, view)[1]
+    return (_values(small)[view, :height, :width] - gain * predicted).nan_to_num(0.0)
+
+
+def independent_samples(image: Float[Tensor, "row column c"]) -> float:
+    """Return the number of independent samples of an image; of white Gaussian noise the number of its pixels.
+
+    The pixels that carry its energy, times the share of frequencies that do.
+    """
+    height, width, channels = image.shape
+    squares = image.double().square().sum(dim=-1)
+    power = torch.fft.fft2(image.double(), s=(2 * height, 2 * width), dim=(0, 1)).abs().square().sum(dim=-1)
+    if not bool(squares.any()):
+        return 0.0
+    pixels, share = squares.sum().square() / squares.square().sum(), power.mean().square() / power.square().mean()
+    return float(pixels * share) * (1 + 2 / channels) * (1 + 1 / channels)  # of Gaussian values, and of a periodogram
 
 
 def _exchanged(predicted: Mapping[int, Tensor], small: Measurement, pair: Correction) -> float:
@@ -642,8 +714,10 @@ def _agreement(small: Measurement, voxels: int) -> float:
     return float(torch.tensor(agreements).median())
 
 
-def open_faces(field: Field, small: Measurement) -> list[Finding]:
-    """Return a finding for each face beyond which the flow seems to extend: rays through it fit worse than others.
+def open_faces(field: Field, small: Measurement, voxels: int = 24) -> list[Finding]:
+    """Return a finding for each face beyond which the flow extends: rays through it fit worse than others.
+
+    A box that is larger there must explain them: rays through the ends of thin or sharp flow fit worse, too.
 
     The others are those through faces known to be ambient only or, without such faces, all that cross neither this
     face nor one already found, the worst first.
@@ -654,7 +728,7 @@ def open_faces(field: Field, small: Measurement) -> list[Finding]:
     closed, rest = torch.ones(len(squares), dtype=torch.bool), torch.ones(len(squares), dtype=torch.bool)
     for face in suspect_faces:
         closed &= ~through[face]
-    findings = {}
+    findings, growth = {}, GROWN * max(small.box.edges)
     for face in sorted(suspect_faces, key=lambda face: -_unexplained(squares[through[face]])):
         inside, others = squares[through[face] & rest], squares[closed if ambient else ~through[face] & rest]
         if len(inside) < MIN_RAYS or len(others) < MIN_RAYS:
@@ -662,24 +736,30 @@ def open_faces(field: Field, small: Measurement) -> list[Finding]:
         share, share_others = _unexplained(inside), _unexplained(others)
         size = float((inside[:, 0].mean() / (others if ambient else squares[rest])[:, 1].mean()).sqrt())
         if size > OPEN_FACE[0] and share > OPEN_FACE[1] * share_others:
+            larger = replace(small, box=small.box.grown([face], growth))
+            wider, _ = fit(larger, round(voxels * max(larger.box.edges) / max(small.box.edges)))
+            if _unexplained(_through_faces(wider, small, larger)[0][through[face] & rest]) > MAX_GROWN * share:
+                continue
             rest &= ~through[face]
             findings[face] = Finding(
                 "open_face",
                 f"face {face}: {share:.0%} of the {measured} of rays through it is unexplained, {share_others:.0%} for "
-                f"other rays; the flow seems to extend beyond it: give --open-faces {face} and --grow 10 (mm), or a "
-                "larger box",
+                f"other rays; the flow seems to extend beyond it: give --open-faces {face} and --grow "
+                f"{growth:.2g} (mm), or a larger box",
             )
     return [findings[face] for face in suspect_faces if face in findings]
 
 
-def _through_faces(field: Field, small: Measurement) -> tuple[Float[Tensor, "n 2"], dict[str, Bool[Tensor, " n"]]]:
-    """Squares of the residual and of the measurement of every valid ray, and which rays cross each face."""
-    model, channels = _path_integral(small), _values(small).shape[-1]
+def _through_faces(
+    field: Field, small: Measurement, larger: Measurement | None = None
+) -> tuple[Float[Tensor, "n 2"], dict[str, Bool[Tensor, " n"]]]:  # fmt: skip
+    """Squares of the residual, of the field in its box, and of the measurement of every valid ray; rays by face."""
+    model, channels, box = _path_integral(larger or small), _values(small).shape[-1], (larger or small).box
     squares: list[Tensor] = []
     through: dict[str, list[Tensor]] = {face: [] for face in FACES}
     for i, camera in enumerate(small.cameras):
         height, width = camera.image_size
-        predicted = predict_view(field, camera, model, small.box).reshape(-1, channels)
+        predicted = predict_view(field, camera, model, box).reshape(-1, channels)
         measured = _values(small)[i, :height, :width].reshape(-1, channels)
         rays = camera.rays(camera.pixel_grid().reshape(-1, 2)).clip(small.box)
         good = torch.isfinite(measured).all(dim=-1) & rays.crosses

@@ -16,6 +16,7 @@ from torch import Tensor
 from nerif.analysis.alignment import aligned
 from nerif.analysis.asymmetry import withhold_half
 from nerif.analysis.gains import gains_of, with_gains
+from nerif.analysis.image_edges import cut_edges
 from nerif.analysis.metrics import coverage, slice_metrics, view_metrics, volume_metrics
 from nerif.analysis.prediction import check_sees, reproject
 from nerif.analysis.residuals import white_noise, whiteness
@@ -153,14 +154,18 @@ def evaluate_views(reprojection: Reprojection) -> list[ViewScores]:
         test = whiteness(residual.nan_to_num(0.0, 0.0, 0.0).numpy(), patterns, mask.numpy())
         return row if test is None else {**row, "residual_test": {**asdict(test), "correlated": test.correlated}}
 
-    views: list[ViewScores] = []
+    views: list[Any] = []
     threads = int(min(torch.get_num_threads(), PARALLEL_PIXELS // sees_box[0].numel()))
     for o in measurement.observations:
         valid = measurement.usable_for(o) & sees_box
         # with several techniques, a view has a row for each that it measured
         indices = [i for i in range(len(valid)) if len(measurement.observations) == 1 or bool(valid[i].any())]
         with ThreadPoolExecutor(max(threads, 1)) as pool:
-            views += pool.map(lambda i, o=o, valid=valid: scores(i, o, valid), indices)
+            rows = dict(zip(indices, pool.map(lambda i, o=o, valid=valid: scores(i, o, valid), indices), strict=True))
+        for edge in sorted(cut_edges(measurement, o), key=lambda edge: edge.signal):
+            if edge.view in rows and not o.technique.derived:
+                rows[edge.view] |= {"cut_edge": edge.side, "cut_signal": edge.signal}
+        views += rows.values()
     return views
 
 

@@ -7,6 +7,7 @@ even if the pattern resembles it: detail that is not yet learned lies where the 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -14,7 +15,9 @@ from typing import Any
 from nerif.reconstruction.rig.parameters import refined_groups
 from nerif.results.directory import Result
 
-__all__ = ["CAUSES", "DEVIATIONS", "WITHHOLD", "Remedy", "advice", "is_fitted", "likely_cause", "longer"]
+__all__ = [
+    "CAUSES", "CHECK", "DEVIATIONS", "SYMMETRY", "WITHHOLD", "Remedy", "advice", "is_fitted", "likely_cause", "longer",
+]  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -69,6 +72,11 @@ CAUSES = {
 }
 """Causes by the names of their patterns (residuals.py)."""
 
+SYMMETRY = Remedy(
+    "one camera determines a symmetric flow only: --symmetry axis, or planar, with --axis-direction X Y Z", "symmetry",
+    ("axis", "planar"),
+)
+CHECK = Remedy("nerif check finds swapped u and v, wrong signs, and mirrored or exchanged images")
 WITHHOLD = Remedy("--withhold auto withholds one in a first run", "withhold", ("auto",))
 DEVIATIONS = Remedy("--uncertainty fast computes standard deviations", "uncertainty", ("fast", "full"))
 LONGER = {
@@ -76,6 +84,7 @@ LONGER = {
     "iterations": "more --iterations", "interrupted": "--resume",
 }  # fmt: skip
 NETWORK = "nerif"  # the method without a penalty
+NEAR_NOISE = 1.5  # rms of a residual over that of the noise
 SMOOTHED = ("blur", "scale")  # patterns that a field leaves, too, which is not yet learned or regularised
 
 
@@ -95,17 +104,20 @@ def is_fitted(cause: str, settings: Mapping[str, Any]) -> bool:
     return entry is not None and entry.group in _words(settings.get("refine", ()))
 
 
-def likely_cause(cause: str, result: Result) -> str:
+def likely_cause(cause: str, result: Result, ratio: float = math.inf) -> str:
     """Return the likely cause of a correlated residual with its remedies.
 
     Parameters
     ----------
     cause : whose pattern it has, one of CAUSES, or empty
+    ratio : rms of the residual over that of the noise; near 1, a run that has not converged only needs more steps
     """
     entry, option, settings = CAUSES.get(cause), longer(result), result.settings
     field = "detail that the field cannot resolve"
     if option:
         field = f"detail not yet learned ({option} may reduce it)"
+        if ratio < NEAR_NOISE and (entry is None or cause in SMOOTHED):
+            return field
     elif cause in SMOOTHED:
         field = f"smoothing by {settings['method']}" if settings.get("method", NETWORK) != NETWORK else ""
     if entry is None:

@@ -29,14 +29,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from nerif.analysis.asymmetry import camera_of
-from nerif.analysis.remedies import DEVIATIONS, WITHHOLD, advice, is_fitted, likely_cause, longer
+from nerif.analysis.image_edges import REMEDY
+from nerif.analysis.remedies import CHECK, DEVIATIONS, SYMMETRY, WITHHOLD, advice, is_fitted, likely_cause, longer
 from nerif.common.conventions import percent
 from nerif.data.volume import field_of
 from nerif.forward.registry import TECHNIQUES
 from nerif.results.directory import Result
 from nerif.results.metrics import HalfAsymmetry, ResidualTest, ViewScores
 
-__all__ = ["RATINGS", "Estimate", "Verdict", "correlated_share", "time_of_fit", "verdict"]
+__all__ = ["RATINGS", "Estimate", "Verdict", "correlated_share", "cut_off", "time_of_fit", "verdict"]
 
 RATINGS = ("use", "use with care", "do not use", "cannot tell")
 
@@ -47,6 +48,7 @@ MIN_MISFIT_RATIO = 0.07  # smallest f / f_1
 VIEWS_FACTOR, DEVIATIONS_FACTOR = 2.0, 1.5  # up and down, the range that holds in nine of ten cases
 
 MIN_EXPLAINED = 0.5  # of the squared signal; a field that explains less is no reconstruction of these data
+MIN_PREDICTED = 0.7  # of the squared signal of a view withheld from a first run, for an estimate of little error
 MAX_USE, MAX_CARE = 0.035, 0.12  # error of the variation
 DOUBTFUL, SEVERE = (1.7, 0.005), (2.2, 0.02)  # grain of a residual, and its correlated part over the signal
 OUTLIER = 1.5  # times the correlated part of the median view
@@ -143,11 +145,14 @@ def verdict(result: Result) -> Verdict:
         return Verdict.of("do not use", None, [f"the run {outcome}"])
     views = _fitted_quantities(metrics.views, result)
     fitted, withheld = ([v for v in views if bool(v["withheld"]) is role] for role in (False, True))
+    cameras = len({camera_of(v["name"]) for v in fitted})  # a view has an entry for each technique, or each half
+    remedy = advice([SYMMETRY], result.settings) if cameras == 1 else CHECK.words
+    cut = cut_off(fitted)
     for group, role in ((fitted, "training"), (withheld, "withheld")):
         share = _explained(group, _noise(fitted))
         if share is not None and share < MIN_EXPLAINED:
             text = f"the field explains {max(share, 0.0):.0%} of the squared signal of the {role} views (noise removed)"
-            return Verdict.of("do not use", None, [text, time_of_fit(result)])
+            return Verdict.of("do not use", None, [text, cut or remedy, time_of_fit(result)])
     estimate, unavailable = _from_views(result, withheld, fitted)
     deviation = _deviation(result)
     if deviation is not None:
@@ -159,12 +164,13 @@ def verdict(result: Result) -> Verdict:
     if axisymmetric and any(d["antisymmetry"] > ASYMMETRIC for d in metrics.asymmetry):
         uneven, not_symmetric = _asymmetry(metrics.asymmetry)
         doubt, severe = "; ".join(filter(None, (uneven, doubt))), severe or not_symmetric
-    cameras = len({camera_of(v["name"]) for v in fitted})  # a view has an entry for each technique, or each half
     time, common = time_of_fit(result), COMMON_MOTION if is_fitted("calibration", result.settings) else ""
     if severe:
-        return Verdict.of("do not use", None, [doubt])
+        return Verdict.of("do not use", None, [cut or doubt, "" if cut else remedy])
     if estimate is not None and estimate.error > MAX_CARE:
-        return Verdict.of("do not use", estimate, [common, doubt, time])
+        return Verdict.of("do not use", estimate, [common, cut or doubt, "" if cut else remedy, time])
+    if cut:  # no estimate includes what lies outside the images
+        return Verdict.of("cannot tell", None, [cut, time])
     if estimate is None and doubt:
         return Verdict.of("use with care", None, [doubt, unavailable, time])
     if estimate is None:
@@ -180,7 +186,33 @@ def verdict(result: Result) -> Verdict:
         doubts.append("the run was interrupted")
     if any(doubts) or estimate.error > MAX_USE or _short_of_time(result):
         return Verdict.of("use with care", estimate, [common, *(f"but {text}" for text in doubts if text), time])
+    if not withheld and (poor := _poor_first_run(result)):
+        return Verdict.of("cannot tell", None, [poor, time])
     return Verdict.of("use", estimate, [common, "no view contradicts the others", time])
+
+
+def cut_off(fitted: Sequence[View]) -> str:
+    """Return the view in which the flow is cut off most by an edge of the image, and the remedy; empty without one."""
+    worst = max((v for v in fitted if "cut_edge" in v), key=lambda v: v["cut_signal"], default=None)
+    if worst is None:
+        return ""
+    return (
+        f"the {worst['measured']} does not fall to zero at the edge of the view ({worst['name']}, {worst['cut_edge']}: "
+        f"{worst['cut_signal']:.0%} of the rms of the image): the flow is wider than the images, and no estimate "
+        f"includes what lies outside; {REMEDY}"
+    )
+
+
+def _poor_first_run(result: Result) -> str:
+    """Why cross-validation gives no estimate: a view that the first run explains too little of; empty if none."""
+    first = result.metrics.cross_validation
+    views = _fitted_quantities(first["views"] if first else [], result)
+    share = _explained(views, _noise(_fitted_quantities(first["fitted_views"] if first else [], result)))
+    if share is None or share >= MIN_PREDICTED:
+        return ""
+    more = f"; {longer(result)} makes it longer" if longer(result) else ""
+    text = f"the first run explains {share:.0%} of the squared signal of its withheld view {views[0]['name']}"
+    return f"{text}: too little for an estimate{more}"
 
 
 def _percent(share: float) -> str:
@@ -352,13 +384,20 @@ def _contradiction(fitted: Sequence[View], result: Result, estimate: Estimate | 
             severe = grain > SEVERE[0] and part > SEVERE[1] and part > limit
             if severe and is_fitted(cause, result.settings):
                 cause, severe = "", estimate is None or part > estimate.high
-            likely = likely_cause(cause, result)
+            likely = likely_cause(cause, result, _over_noise(group, worst))
             return f"{views} spatially correlated ({worst}: {percent(part)} of the signal), as with {likely}", severe
         shares = {v["name"]: v["rms"] / v["rms_predicted"] for v in group}
         worst, median = max(shares, key=lambda k: shares[k]), statistics.median(shares.values())
         if median > 0 and shares[worst] > UNEVEN * median:
             return f"view {worst}: residual {shares[worst] / median:.1f} × the median of all views", False
     return "", False
+
+
+def _over_noise(views: Sequence[View], name: str) -> float:
+    """The rms of the residual of a view over the stated noise, else over that of neighbouring pixels."""
+    view = next(v for v in views if v["name"] == name)
+    noise = view.get("rms_sigma") or view.get("rms_white") or 0.0
+    return view["rms"] / noise if noise > 0 else math.inf
 
 
 def _asymmetry(asymmetry: Sequence[HalfAsymmetry]) -> tuple[str, bool]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from nerif.analysis.evaluation import rms_with_unit
 from nerif.analysis.remedies import WITHHOLD, Remedy, advice, likely_cause, longer
-from nerif.analysis.verdict import correlated_share, time_of_fit, verdict
+from nerif.analysis.verdict import correlated_share, cut_off, time_of_fit, verdict
 from nerif.common.conventions import percent, with_unit
 from nerif.data.volume import INDEX, field_of, name_of
 from nerif.forward.registry import TECHNIQUES
@@ -269,6 +269,8 @@ def _of_residuals(result: Result) -> list[Statement]:
 
 def _of_correlated_residuals(result: Result) -> list[Statement]:
     views = [v for v in _views(result, False) if not (v.get("residual_test") or {"white": True})["white"]]
+    if cut := cut_off(_views(result, False)):  # it leaves residuals of any pattern
+        return [Statement("warning", f"{cut[0].upper()}{cut[1:]}.")]
     remarks = []
     for cause in dict.fromkeys(v["residual_test"]["cause"] for v in views):
         group = sorted(
@@ -281,7 +283,7 @@ def _of_correlated_residuals(result: Result) -> list[Statement]:
         where = f"row {worst['residual_test']['row']:.0f}, column {worst['residual_test']['column']:.0f}"
         size = f"up to {percent(share)} of the signal"
         text = f"{verb} spatially correlated, {size} in {_place(worst, views)} around {where}."
-        text += f" Likely cause: {likely_cause(cause, result)}."
+        text += f" Likely cause: {likely_cause(cause, result, worst.get('rms_over_sigma', math.inf))}."
         remarks.append(Statement("warning" if share > CORRELATED else "note", text))
     return remarks
 

@@ -67,6 +67,10 @@ class ViewScores(TypedDict):
     rms_over_sigma: NotRequired[Score]
     residual_test: NotRequired[ResidualTest]
     """Given enough pixels."""
+    cut_edge: NotRequired[str]
+    """Edge of the image, left, right, top or bottom, at which the flow is cut off most."""
+    cut_signal: NotRequired[Score]
+    """Rms of the signal along it over that of the image."""
 
 
 class PredictionAccuracy(TypedDict):
