@@ -14,6 +14,7 @@ from nerif.cli.cli import main
 from nerif.data.reprojection import Reprojection
 from nerif.data.volume import Volume
 from nerif.geometry import Box, Grid
+from nerif.geometry.symmetry import Axis, Symmetry
 from nerif.physics.quantities import GasSettings, derive
 from nerif.plotting.notebook import number
 from nerif.report import html, packing
@@ -267,6 +268,16 @@ def test_statements_on_the_run(tmp_path, metrics, level, phrase):
     found = statements(Result(tmp_path, metrics=Metrics(views=[FIT, GOOD], **metrics)))
     assert worst(found) == level
     assert any(s.level == level and phrase in s.text for s in found)
+
+
+def test_the_report_gives_the_axis_and_the_correlation_of_the_halves(tmp_path):
+    symmetry = Symmetry.about("axis", (1.5, 0.0, 0.0), (0.0, 0.0, 1.0), 0.1)
+    axis = Axis(symmetry, (0.31, 0.0, 0.02, 0.0), (1.5, 1.5, 0.03, 0.03), (0.04, 1.5, 0.001, 0.03), 1.0)
+    halves = [{"name": "cam", "measured": "displacement", "cc": {"u": 0.952, "v": 0.938}, "antisymmetry": 0.09}]
+    texts = [s.text for s in statements(Result(tmp_path, metrics=Metrics(axis=axis.record, asymmetry=halves)))]
+    for phrase in ("Axis: through (1.500, 0.000, 0.000) mm", "+0.31 +- 0.04 mm", "cannot be determined",
+                   "the halves of the displacement correlate by u 0.952, v 0.938; 9% of the signal"):  # fmt: skip
+        assert sum(phrase in text for text in texts) == 1 + (phrase == "cannot be determined")
 
 
 def test_missing_curves_and_truth_are_no_fault_of_the_result(copy):

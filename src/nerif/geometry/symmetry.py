@@ -279,6 +279,14 @@ class Axis:
         named = {key: dict(zip(NAMES, column, strict=True)) for key, column in columns.items()}
         return {"symmetry": asdict(self.symmetry), **named}
 
+    @classmethod
+    def of_record(cls, entries: Mapping[str, Any]) -> Axis:
+        """Return the axis of entries of metrics.json, without its residual."""
+        values, prior, posterior = (
+            tuple(entries[key][name] for name in NAMES) for key in ("values", "prior_sigma", "posterior_sigma")
+        )
+        return cls(Symmetry.from_entries(entries["symmetry"]), values, prior, posterior, math.nan)
+
     @property
     def sentences(self) -> list[str]:
         """Position and direction of the axis, and their changes by the refinement."""

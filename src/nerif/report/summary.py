@@ -9,12 +9,14 @@ from typing import Any
 
 import numpy as np
 
+from nerif.analysis.asymmetry import asymmetry_sentence
 from nerif.analysis.evaluation import rms_with_unit
 from nerif.analysis.remedies import WITHHOLD, Remedy, advice, likely_cause, longer
 from nerif.analysis.verdict import correlated_share, cut_off, time_of_fit, verdict
 from nerif.common.conventions import percent, with_unit
 from nerif.data.volume import INDEX, field_of, name_of
 from nerif.forward.registry import TECHNIQUES
+from nerif.geometry.symmetry import Axis
 from nerif.physics.quantities import GasChanges
 from nerif.plotting.drawing import LABELS, plotted_quantities, plotted_values
 from nerif.plotting.notebook import number, span
@@ -187,7 +189,7 @@ def statements(result: Result) -> list[Statement]:
     remarks = [Statement("bad" if gap.name in VITAL else "note", gap.sentence) for gap in result.missing]
     for part in (
         _of_outcome, _of_withheld_views, _of_residuals, _of_correlated_residuals, _of_truth, _of_gas, _of_masks,
-        _of_bootstrap, _of_rig,
+        _of_bootstrap, _of_rig, _of_axis,
     ):  # fmt: skip
         remarks += part(result)
     return sorted(remarks, key=lambda s: -LEVELS.index(s.level))
@@ -322,6 +324,14 @@ def _of_rig(result: Result) -> list[Statement]:
     first, *lines = refinement_lines(table)
     remarks = [Statement("note", f"Camera refinement: {first}.")]
     return remarks + [Statement("warning", f"{line[0].upper()}{line[1:]}.") for line in lines]
+
+
+def _of_axis(result: Result) -> list[Statement]:
+    """The axis of a symmetric flow, and the halves of its images."""
+    axis = result.metrics.axis
+    lines = [line[0].upper() + line[1:] for line in Axis.of_record(axis).sentences] if axis else []
+    lines += [f"View {asymmetry_sentence(row)}" for row in result.metrics.asymmetry]
+    return [Statement("note", f"{line}.") for line in lines]
 
 
 def _of_masks(result: Result) -> list[Statement]:
