@@ -270,6 +270,13 @@ def test_halves_may_differ_where_the_flow_may(symmetry, word):
     assert found.rating == word
 
 
+def test_a_flow_along_another_axis_is_of_no_use():
+    axis = {"symmetry": AXIS, "better_direction": [1.0, 0.0, 0.0]}
+    found = judged(views=views_of(0.02), cross_validation=first_run(0.1), axis=axis)
+    assert found.rating == "do not use"
+    assert "--axis-direction 1 0 0" in found.reasons
+
+
 def test_asymmetry_does_not_excuse_a_contradicting_view():
     views, roughly = [*VIEWS[1:], view("a", 0.06, **CORRELATED)], [{**ASYMMETRY, "antisymmetry": 0.3}]
     found = judged(views=views, cross_validation=FIRST, axis={"symmetry": AXIS}, asymmetry=roughly)

@@ -17,10 +17,12 @@ from nerif.forward.base import midpoints
 from nerif.forward.emission import Emission
 from nerif.forward.path_integral import PathIntegral
 from nerif.forward.registry import forward_models
-from nerif.geometry import Box, Grid, Lens, paper_rig
+from nerif.geometry import Box, Grid, Lens, Ring, paper_rig
 from nerif.geometry.symmetry import Symmetry
 from nerif.reconstruction.neural.neural import NeRIF
-from nerif.reconstruction.symmetry import check_views, find_axis, symmetry_of, too_few_views
+from nerif.reconstruction.symmetry import (
+    axis_of, better_direction, check_views, find_axis, symmetry_of, too_few_views,
+)  # fmt: skip
 from nerif.reconstruction.voxels.landweber import Landweber
 from nerif.reconstruction.voxels.layout import Symmetric
 from nerif.reconstruction.voxels.multiplicative import MLEM
@@ -130,6 +132,23 @@ def test_two_views_determine_the_axis():
     along = axis.symmetry.direction
     assert math.hypot(x - z * along[0] / along[2], y - z * along[1] / along[2]) < 0.1
     assert math.hypot(*along[:2]) < 0.005
+
+
+@pytest.mark.parametrize(("along", "stated", "better"), [
+    ("x", None, (1.0, 0.0, 0.0)), ("z", None, ()), ("x", (0.0, 0.0, 1.0), ()), ("x", (1.0, 0.0, 0.0), ()),
+])  # fmt: skip
+def test_a_jet_along_another_edge_of_the_box_is_noticed(along, stated, better):
+    box = Box.cube(50.0)
+    ring = Ring(views=1, arc=(90.0, 90.0), image_size=(20, 20), pixel_pitch=0.2)
+    measurement = simulate(make_phantom("plume", box), ring.cameras(), box, 1.00027, 0.02, steps=30)
+    if along == "x":  # the rig is turned about y instead
+        turn = torch.tensor([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]], dtype=torch.float64)
+        (camera,) = measurement.cameras
+        plane = replace(camera.background, normal=turn.T @ camera.background.normal)
+        turned = replace(camera, rotation=camera.rotation @ turn, background=plane)
+        measurement = replace(measurement, cameras=(turned,))
+    settings = Tikhonov(symmetry="axis", axis_direction=stated, axis_sigma_mm=1e-3, axis_sigma_deg=1e-3)
+    assert better_direction(settings, measurement, axis_of(settings, measurement)) == better
 
 
 def test_the_axis_can_be_fixed(jet):

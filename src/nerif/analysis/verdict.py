@@ -160,6 +160,10 @@ def verdict(result: Result) -> Verdict:
         estimate = other if estimate is None else estimate.mean(other)
     doubt, severe = _contradiction(fitted, result, estimate)
     symmetry = metrics.axis["symmetry"] if metrics.axis else {}
+    if metrics.axis and (better := metrics.axis.get("better_direction")):
+        direction = " ".join(f"{x:g}" for x in better)
+        text = f"not axisymmetric about z: --axis-direction {direction}, about which a coarse field fits far better"
+        return Verdict.of("do not use", None, [text])
     axisymmetric = bool(symmetry) and not symmetry.get("harmonics")  # with harmonics the halves may differ
     if axisymmetric and any(d["antisymmetry"] > ASYMMETRIC for d in metrics.asymmetry):
         uneven, not_symmetric = _asymmetry(metrics.asymmetry)

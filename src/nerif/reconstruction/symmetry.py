@@ -33,7 +33,7 @@ from nerif.reconstruction.voxels.levels import bins_of
 from nerif.reconstruction.voxels.problem import Penalty, Problem
 from nerif.reconstruction.voxels.symmetric_operator import SymmetricOperator
 
-__all__ = ["axis_of", "check_views", "find_axis", "symmetry_of", "too_few_views", "with_axis"]
+__all__ = ["axis_of", "better_direction", "check_views", "find_axis", "symmetry_of", "too_few_views", "with_axis"]
 
 VOXELS = 40  # along the longest edge of the box
 MAX_RAYS = 6000
@@ -44,6 +44,7 @@ RIDGE = 1e-12  # of the mean curvature, for coefficients that no ray crosses
 NUDGE = 1e-3  # of the longest edge of the box, or rad: step of finite differences
 MIN_ACROSS = math.sin(math.radians(15)) ** 2  # mean square component in the image planes of a direction that is fitted
 AXIS_SIGMA = 0.03  # of the longest edge of the box: default standard deviation of the position
+MAX_RESIDUAL = 0.7  # of a coarse field about another edge of the box, over that about z
 ROUNDING = 0.002  # of the longest edge of the box: radius within which the field is rounded
 
 AnySettings = TypeVar("AnySettings", bound=SharedSettings)
@@ -177,6 +178,22 @@ def too_few_views(settings: SharedSettings, measurement: Measurement) -> str:
 def _determined(views: int) -> str:
     """Return the symmetry with the most harmonics that this number of views determines."""
     return f"axis+{(views - 1) // 2}" if views > 2 else "axis"
+
+
+def better_direction(settings: SharedSettings, measurement: Measurement, axis: Axis) -> tuple[float, ...]:
+    """Return the edge of the box about which a coarse field fits far better than about an axis; none if stated or best.
+
+    An axis of no stated direction is along z; a flow along x is often symmetric about that, too, but not axisymmetric.
+    """
+    if settings.axis_direction is not None or not axis.symmetry.axial or math.isnan(axis.residual):
+        return ()
+    along = _viewing_directions(measurement).square().mean(dim=0)
+    residuals = {}
+    for direction, share in zip(((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)), along.tolist(), strict=False):
+        if 1 - share > MIN_ACROSS and (other := axis_of(replace(settings, axis_direction=direction), measurement)):
+            residuals[direction] = other.residual
+    best = min(residuals, key=lambda d: residuals[d], default=())
+    return best if best and residuals[best] < MAX_RESIDUAL * axis.residual else ()
 
 
 def axis_of(settings: SharedSettings, measurement: Measurement) -> Axis | None:

@@ -105,6 +105,8 @@ class AxisEstimate(TypedDict):
     posterior_sigma: dict[str, float]
     constrained: dict[str, bool]
     """By the data."""
+    better_direction: NotRequired[list[float]]
+    """About which a coarse field fits far better."""
 
 
 class HalfAsymmetry(TypedDict):

@@ -33,7 +33,7 @@ from nerif.reconstruction.rig.parameters import refinement_lines, with_correctio
 from nerif.reconstruction.rig.posterior import RigPosterior
 from nerif.reconstruction.rig.refinement import refit, with_rig
 from nerif.reconstruction.shared_settings import SHORT_RUN, SharedSettings
-from nerif.reconstruction.symmetry import axis_of
+from nerif.reconstruction.symmetry import axis_of, better_direction
 from nerif.reconstruction.uncertainty.deviations import VOXELS, Deviations
 from nerif.results.directory import CALIBRATION, versions
 from nerif.results.metrics import Metrics
@@ -318,7 +318,9 @@ class WriteAxis(PipelineStep):
         axis, views = result.axis, with_corrections(job.inputs.all_views, result.rig)
         assert axis is not None
         halves = asymmetry(views, axis.symmetry) if axis.symmetry.axial else []
-        job.out.add_metrics(axis=axis.record, asymmetry=halves)
+        assert isinstance(job.reconstructor, SharedSettings)
+        better = better_direction(job.reconstructor, job.measurement, axis)
+        job.out.add_metrics(axis=axis.record | ({"better_direction": list(better)} if better else {}), asymmetry=halves)
         for line in (*axis.sentences, *(asymmetry_sentence(d) for d in halves)):
             job.monitor.say(line)
 
