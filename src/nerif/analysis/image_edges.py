@@ -64,7 +64,7 @@ def cut_edges(measurement: Measurement, observation: Observation) -> list[CutEdg
     edges, ambient = [], measurement.ambient_faces if observation.technique.gauge else FACES
     box = measurement.box.grown(FACES, GROWTH * max(measurement.box.edges))
     points = Grid.of_resolution(box, POINTS).points(torch.float64).reshape(-1, 3)
-    shown = [_inside(camera, points) for camera in measurement.cameras]
+    visible = [_inside(camera, points) for camera in measurement.cameras]
     for i, camera in enumerate(measurement.cameras):
         height, width = camera.image_size
         usable = measurement.usable[i, :height, :width]
@@ -79,7 +79,7 @@ def cut_edges(measurement: Measurement, observation: Observation) -> list[CutEdg
         d = d - border.nanmedian(dim=0).values  # of a camera that moved
         whole, beyond = _mean_square(d, 1), _beyond(camera, points)
         for side, strip in strips.items():
-            others = [float(beyond[side][s].double().mean()) for j, s in enumerate(shown) if j != i and s.any()]
+            others = [float(beyond[side][s].double().mean()) for j, s in enumerate(visible) if j != i and s.any()]
             wide = _face(camera, side) in ambient and (not others or statistics.fmean(others) > MIN_BEYOND)
             square = _mean_square(d[strip], 0 if side in ("left", "right") else 1)
             if wide and square > MIN_SIGNAL**2 * whole > 0 and float(crosses[strip].double().mean()) > 0.5:
