@@ -27,6 +27,7 @@ CLIP = 4.0  # standard deviations; an edge or a reflection does not outweigh the
 TILE = 16  # px
 MIN_PIXELS = 10_000  # of an image; in smaller ones, half hidden and noisy, one scene correlates no more than chance
 HIGH = 0.3  # correlation that no two scenes have
+SHIFTED = 4.0  # px, shortest shift of a whole image that is looked for before displacements
 LARGE = 0.2  # share of the image that has to move as a whole
 SIGNIFICANT = 8.0  # standard deviations over all shifts; the highest peak of two scenes has five
 
@@ -111,8 +112,10 @@ def match(first: Thumbnail, second: Thumbnail) -> tuple[float, Float[np.ndarray,
 
 
 def common_shift(first: Thumbnail, second: Thumbnail) -> Float[np.ndarray, " 2"]:
-    """Return the shift (x, y) of the second image as a whole, px; 0 if more of it correlates without a shift."""
+    """Return the shift (x, y) of the second image as a whole, px; 0 if short, or if more correlates without a shift."""
     shift = match(first, second)[1]
+    if np.linalg.norm(shift) < SHIFTED:
+        return np.zeros(2)
     still, moved = (
         float(np.mean(local_correlation(shifted(first, s), second.detail, TILE / 2) > HIGH)) for s in (0 * shift, shift)
     )

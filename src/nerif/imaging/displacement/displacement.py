@@ -45,7 +45,6 @@ REACH = {"deepflow": 1.5, "dis": 1.5, "tvl1": 1.3, "ilk": 1.6, "correlation": 1.
 
 OVEREXPOSED, UNEVEN = "over-exposed", "displaced too unevenly"  # causes of loss
 FAR = 5.0  # px beyond the shift of the whole image; from here on d is measured in both directions
-SHIFTED = 4.0  # px, shift of the whole image that is looked for before displacements
 MAX_REPEATS = 12  # reference frames that are compared with the mean of the others,
 MEGAPIXEL = 2**20  # in images up to this number of pixels
 
@@ -88,7 +87,7 @@ class DisplacementMap:
     noise_source : "repeats" (of the reference, and residual) or "structure tensor"
     pair : the images; None for the mean of several
     losses : shares of the region's pixels that are not valid, by cause, the largest first
-    shift : of the whole image (u, v) between reference and flow, px; 0 below SHIFTED
+    shift : of the whole image (u, v) between reference and flow, px; 0 below 4 px
     """
 
     displacement: Vectors
@@ -121,9 +120,7 @@ def _displacement_and_shift(
         )
     first, second = _equalised(as_float(flow), as_float(reference), settings.local_contrast)
     u, v = common_shift(Thumbnail.of(second), Thumbnail.of(first)).round().astype(int).tolist()
-    if np.hypot(u, v) < SHIFTED:
-        u, v = 0, 0
-    else:
+    if u or v:
         rows, columns = (np.clip(np.arange(n) - s, 0, n - 1) for n, s in zip(second.shape, (v, u), strict=True))
         second = second[np.ix_(rows, columns)]
     movement = FLOWS[settings.method](first, second, settings.smoothness)
