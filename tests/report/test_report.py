@@ -216,7 +216,7 @@ FIT, GOOD = view(False, 0.99, 1.0), view(True, 0.99, 1.0)
         ([view(False, 0.99, 0.4), GOOD], "warning", "fits noise"),
         ([view(False, 0.99, 2.0), GOOD], "warning", "possible causes"),
         ([view(False, 0.99, 5.0), GOOD], "bad", "possible causes"),
-        ([view(False, 0.99, 0.6), view(False, 0.3, 12.0), GOOD], "bad", "12.0 ×"),
+        ([view(False, 0.99, 0.6), view(False, 0.3, 12.0), GOOD], "bad", "12.0 times"),
         ([view(False, 0.99, 0.6), view(False, 0.3, 2.0), GOOD], "warning", "fits noise"),
         ([view(True, 0.99, 1.8)], "note", "No training view"),
         ([view(True, 0.99, None)], "note", "No training view"),
