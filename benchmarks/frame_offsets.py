@@ -81,6 +81,7 @@ class Film:
             frames.append(predict(field, ring.cameras(), BOX, N_AMBIENT, samples=40))
         d = torch.stack([frame.displacements for frame in frames])
         d += NOISE * d.square().mean().sqrt() * torch.randn(d.shape, generator=torch.Generator().manual_seed(seed))
+        self.times = tuple(float(i) for i in range(count))
         self.frames: list[Measurement] = []
         for i in range(4, count + 4):
             values = torch.stack([d[i - late.get(view, 0), view] for view in range(views)])

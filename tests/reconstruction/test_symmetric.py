@@ -21,7 +21,12 @@ from nerif.geometry import Box, Grid, Lens, Ring, paper_rig
 from nerif.geometry.symmetry import Symmetry
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.symmetry import (
-    axis_of, better_direction, check_views, find_axis, symmetry_of, too_few_views,
+    axis_of,
+    better_direction,
+    check_views,
+    find_axis,
+    symmetry_of,
+    too_few_views,
 )  # fmt: skip
 from nerif.reconstruction.voxels.landweber import Landweber
 from nerif.reconstruction.voxels.layout import Symmetric

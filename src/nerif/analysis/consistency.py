@@ -551,7 +551,7 @@ def orders(cameras: Sequence[Camera]) -> list[Correction]:
 def _most_likely_mistake(
     small: Measurement, voxels: int, on_step: Callable[[int, int], None]
 ) -> tuple[Correction | None, str]:  # fmt: skip
-    """The correction that improves the joint fit most, if it does so clearly, and a doubt: one that chance may explain."""
+    """The correction that clearly improves the joint fit most, and a doubt: one that chance may explain."""
     views, doubt = range(len(small.names)), ""
     observation, d = small.observations[0], _values(small)
     pairs = _exchanges(small.cameras)

@@ -162,8 +162,10 @@ class Volume:
         title, values = describe(self.quantity)[1], np.asarray(self)
         finite = values[np.isfinite(values)]
         unit = "" if self.unit == "1" else f" {self.unit}"
-        ends = np.quantile(finite, [0.001, 0.999]) if finite.size else ()  # without single voxels
-        limits = f"{ends[0]:.4g} to {ends[1]:.4g}{unit} (0.1 to 99.9 %)" if finite.size else "masked everywhere"
+        limits = "masked everywhere"
+        if finite.size:
+            low, high = np.quantile(finite, [0.001, 0.999])  # without single voxels
+            limits = f"{low:.4g} to {high:.4g}{unit} (0.1 to 99.9 %)"
         shape, (x, y, z) = " x ".join(map(str, self.grid.shape)), self.grid.box.edges
         return f"<Volume {self.quantity}: {title}, {limits}; {shape} voxels (z, y, x), {x:g} x {y:g} x {z:g} mm>"
 

@@ -13,6 +13,8 @@ from abc import ABC, abstractmethod
 from dataclasses import asdict, replace
 from typing import Any, ClassVar
 
+import numpy as np
+
 from nerif.analysis.asymmetry import asymmetry, asymmetry_sentence
 from nerif.analysis.evaluation import evaluate_views, score_lines
 from nerif.analysis.prediction import reproject
@@ -247,7 +249,7 @@ class WriteSurface(PipelineStep):
         for name, values in surface.quantities.items():
             present = values[values.isfinite()]
             if len(present):
-                low, high = present.double().quantile(torch.tensor([0.001, 0.999], dtype=torch.float64)).tolist()
+                low, high = np.quantile(present, [0.001, 0.999])
                 unit = unit_shown(describe(name)[0])
                 job.monitor.say(f"surface of the bodies: {name} {low:.4g} to {high:.4g} {unit} (0.1 to 99.9 %)")
 
