@@ -315,8 +315,8 @@ def test_tables_of_another_kind_are_not_drawn(copy, name, content, phrase):
 def test_a_liquid_has_no_temperature(tmp_path):
     grid = Grid(Box.cube(4.0), (4, 5, 6))
     volumes = derived(Volume(torch.zeros(grid.shape), grid, attributes={"n_ambient": 1.333}), "density", "temperature")
-    result = Result(tmp_path, volumes=volumes)
-    assert any("are not valid" in s.text and s.level == "warning" for s in statements(result))
+    result = Result(tmp_path, {"gas": {}}, volumes=volumes)
+    assert any("not computed: the ambient index 1.333" in s.text and s.level == "warning" for s in statements(result))
     scene = re.search(r'<script type="application/json" id="scene">(.*?)</script>', html.render(result))
     assert "NaN" not in scene[1]
 
@@ -324,7 +324,8 @@ def test_a_liquid_has_no_temperature(tmp_path):
 def test_masked_voxels_are_reported(tmp_path):
     volume = smooth((6, 5, 4))
     volume.values[:3] = -3e-4
-    found = statements(Result(tmp_path, volumes={"density": derive(volume, "density", GasSettings())}))
+    density = derive(volume, "density", GasSettings(uniform_pressure="yes"))
+    found = statements(Result(tmp_path, volumes={"density": density}))
     assert any("60 voxels (50.00%)" in s.text and s.level == "warning" for s in found)
 
 

@@ -23,7 +23,7 @@ def velocity_verdict(store: VelocitySequence) -> Verdict:
     """Return the verdict on a velocity that was computed from a film."""
     about = store.attributes
     settings, misfit, unexplained = about.get("settings", {}), float(about["misfit"]), about.get("unexplained")
-    known, spread = known_share(store), relative_deviation(store, COMPONENTS)
+    share, spread = known_share(store), relative_deviation(store, COMPONENTS)
     level = [sum(misfit > limit for limit in MISFIT)]
     changes = f"the density changes that the velocity does not explain are {misfit:.2g} times those of noise and grid"
     longer = "more time (--time-limit), " if about.get("falling") else ""
@@ -42,9 +42,9 @@ def velocity_verdict(store: VelocitySequence) -> Verdict:
     if about.get("falling"):
         level.append(1)
         reasons.append("the fit ended at its limits while its residual still fell")
-    if known < KNOWN[0]:
-        level.append(1 + (known < KNOWN[1]))
-        reasons.append(f"it is known in {known:.1%} of the box only")
+    if share < KNOWN[0]:
+        level.append(1 + (share < KNOWN[1]))
+        reasons.append(f"it is known in {share:.1%} of the box only")
     if about.get("physics") == "transport":
         level.append(1)
         reasons.append(
