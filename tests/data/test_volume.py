@@ -31,7 +31,8 @@ def volumes() -> list[Volume]:
     excess[1, 2, 3] = -3.0e-4  # n - 1 < 0
     excess[4, 0, 1] = -2.69e-4  # n - 1 = 1e-6: 80,000 K
     first = Volume(excess, GRID, attributes={"n_ambient": 1.00027})
-    return [derive(first, q, GasSettings("N2", uniform_pressure="yes")) for q in ("index_excess", "n", "density", "temperature")]
+    gas = GasSettings("N2", uniform_pressure="yes")
+    return [derive(first, q, gas) for q in ("index_excess", "n", "density", "temperature")]
 
 
 def test_masked_voxels_are_counted_and_explained(volumes):
