@@ -427,7 +427,7 @@ def test_every_command_takes_a_settings_file_and_has_help(tmp_path, capsys, refu
     file.write_text("nothing_of_the_kind = 1\n")
     assert "unknown key 'nothing_of_the_kind'" in refusal(command, "--config", file)
     assert "no such settings file" in refusal(command, f"--config={tmp_path / 'none.toml'}")
-    assert run(command, "--help", *(["all"] if command == "reconstruct" else [])) == 0
+    assert run(command, "--help", *(["all"] if command in ("reconstruct", "sequence") else [])) == 0
     assert "TOML file of settings" in " ".join(capsys.readouterr().out.split())
 
 

@@ -25,6 +25,7 @@ from nerif.report.pages import slices
 
 RIG = str.split("--image-size 14 18 --pixel-pitch 0.25 --views 4 --steps 30 --truth-voxels 12")
 QUICK = str.split("--method tikhonov --voxels 10 --basis linear --iterations 20 --regularisation 0.01")
+QUICK += ["--gas.uniform-pressure", "yes"]
 
 
 def std_of(result: Path) -> np.ndarray:

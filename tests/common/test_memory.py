@@ -49,6 +49,8 @@ def limit() -> Iterator[None]:
 def imagej(folder: Path) -> None:
     about = f"ImageJ=1.11a\nimages={1 << 27}\nslices={1 << 27}\n"
     tifffile.imwrite(folder / "a.tif", np.zeros((1, 1), np.uint8), description=about, metadata=None)
+    with (folder / "a.tif").open("ab") as file:
+        file.write(bytes(9))  # else it is one image of a stack
     open_frames(folder / "a.tif")[0]
 
 

@@ -77,7 +77,7 @@ def test_the_project_of_the_app(folder, expected, tmp_path, monkeypatch):
     assert workspace.draft("design") == expected["project"]["design"]
     assert workspace.jobs.at_once == expected["project"]["at_once"]
     (job,) = workspace.jobs.all()
-    assert (job.state, list(job.arguments)) == ("refused", expected["project"]["run"])
+    assert (job.state, list(job.arguments)) == ("held", expected["project"]["run"])
     findings = read_findings(folder / "project" / OWN / "checks" / "m.json")
     assert [view.name for view in findings.views] == list(nerif.read(folder / "measurement-1.0.nc").names)
 

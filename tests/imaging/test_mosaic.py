@@ -352,7 +352,6 @@ def test_displacements_have_the_error_of_a_grey_camera_of_half_the_size(tmp_path
 
     (as_grey, _), (binned, honest) = evaluate(replace(raw, mosaic="none")), evaluate(raw)
     grey_camera, _ = evaluate(find_views(tmp_path / "half")[0])
-    assert as_grey > 0.06
-    assert binned < 0.5 * as_grey
+    assert binned < 0.7 * as_grey
     assert binned < 1.1 * grey_camera
     assert 0.3 < honest < 1.5

@@ -82,13 +82,13 @@ BURNT = "N2:0.72, H2O:0.19, CO2:0.09"
         (1.0007, -1e-4, {}, "dT", "--gas.composition"),  # sulphur hexafluoride around
         (1.00135, -1e-4, {}, "dT", "--gas.pressure-pa"),  # air at 5 bar
         (1.00135, -1e-4, {"pressure_pa": 5e5}, "", ""),
-        (1.00027, -2.37e-4, {}, "dT", "hotter than 2300 K"),  # helium in air
-        (1.00027, -2.9e-4, {"composition": BURNT}, "dT", "hotter than 4000 K"),
+        (1.00027, -2.37e-4, {}, "T", "hotter than 2300 K"),  # helium in air
+        (1.00027, -2.9e-4, {"composition": BURNT}, "T", "hotter than 4000 K"),
         (1.00027, -2.37e-4, {"composition": BURNT}, "", ""),  # hot products
         (1.00027, -2.37e-4, {"uniform_pressure": "yes"}, "", "helium or fuel"),
         (1.00027, -2.37e-4, {"uniform_pressure": "no"}, "T", "not uniform"),
         (1.00027, -2.2e-4, {}, "", "helium or fuel"),  # a flame, or a diluted jet of helium
-        (1.00027, 4.3e-4, {}, "dT", "colder than 200 K"),  # sulphur hexafluoride in air
+        (1.00027, 4.3e-4, {}, "T", "colder than 200 K"),  # sulphur hexafluoride in air
         (1.00027, -1e-4, {}, "", ""),
     ],
 )

@@ -192,7 +192,7 @@ def test_standard_deviations_average_the_squares_of_errors_around_each_voxel(ori
 
 
 def test_temperatures_beyond_the_relation_are_masked_and_counted(original):
-    deviations = BootstrapDeviations(flat(8, -2.6e-4), GasSettings(), original)
+    deviations = BootstrapDeviations(flat(8, -2.6e-4), GasSettings(uniform_pressure="yes"), original)
     member = Member(NeRIF(), original.measurement, flat(8, -2.3e-4))
     deviations.add_trial(member, trial_of(flat(8, -2.6e-4), 0.0))
     volumes = {v.quantity: v for v in deviations.volumes()}

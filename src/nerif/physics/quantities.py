@@ -111,11 +111,11 @@ class GasSettings:
         if coldest <= cold and hot <= hottest:
             return {}
         end = f"hotter than {hottest:g} K" if hot > hottest else f"colder than {coldest:g} K"
-        reason = (
-            f"{QUARTER:.0%} of the flow would be {self.composition} {end} at a uniform pressure: it is another gas "
-            "(--gas.composition), or the pressure varies (--gas.uniform-pressure no computes density alone, yes both)"
-        )
-        return {"density": reason, "temperature": reason}
+        return {
+            "temperature": f"{QUARTER:.0%} of the flow would be {self.composition} {end} at a uniform pressure: the "
+            "pressure varies, or it is another gas, and the density is wrong, too (--gas.composition); "
+            "--gas.uniform-pressure yes computes it all the same"
+        }
 
     def remarks(self, excess: Volume) -> list[str]:
         """Return lines on the quantities that do not follow from a field, and on what its temperature implies."""

@@ -84,11 +84,11 @@ def velocity_of_film(
         raise InputError(f"expected a part of 0 to {len(store)}, got {first} to {last}", field="frames")
     theta, times = densities(store, slice(first, last)), store.times[first:last]
     checkpoint = out.with_suffix(".checkpoint.safetensors")
-    settings.check(theta, store.grid, times)
     symmetry = store.attributes.get("symmetry")
     section = section_of(store.grid, Symmetry.from_entries(symmetry) if symmetry else None)
     method = section.settings(settings)
     improvement = _improvement(store, theta, slice(first, last), measurement, density, say)
+    settings.check(theta, store.grid, times)
     displacements = None if improvement is None else improvement.inputs
     place = [store.grid.box.lower, store.grid.box.upper, store.n_ambient, symmetry]
     inputs = digest([theta, list(times), place, _without_limits(method), displacements])

@@ -38,8 +38,8 @@ def print_help(default: Any, prog: str) -> None:
         *"\n\n".join(textwrap.fill(text, WIDTH) for text in description.split("\n\n")).splitlines(),
     ]
     for group, options in GROUPS.items():
-        if known := [name for name in options if name in names]:
-            lines += ["", f"{group}:", *(line for name in known for line in _option(default, names[name]))]
+        if usable := [name for name in options if name in names]:
+            lines += ["", f"{group}:", *(line for name in usable for line in _option(default, names[name]))]
     lines += [
         "",
         "--help all lists every option. Any of them can also be given as --set NAME=VALUE, such as",

@@ -55,7 +55,8 @@ def read_colmap(path: Path) -> list[CalibratedCamera]:
 
 def _rows(path: Path) -> list[list[str]]:
     """Return the words of the lines of a file without comments and points, which are groups of three numbers."""
-    lines = [line.split() for line in path.read_text("utf-8", "replace").splitlines() if not line.startswith("#")]
+    text = path.read_text(encoding="utf-8", errors="replace")
+    lines = [line.split() for line in text.splitlines() if not line.startswith("#")]
     return [w for w in lines if len(w) % 3 or any(word.strip("-+.eE0123456789") for word in w)]
 
 
