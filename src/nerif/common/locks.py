@@ -56,10 +56,12 @@ def locked(out: Path, inside: bool = False, wait: bool = False) -> Iterator[None
 def _acquired(lock: Path, out: Path, wait: bool) -> int:
     """Return the open lock file, which is locked and says by whom."""
     for last in [False] * ATTEMPTS + [True]:
-        lock.parent.mkdir(parents=True, exist_ok=True)
         try:
+            lock.parent.mkdir(parents=True, exist_ok=True)
             file = os.open(lock, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o666)
-        except FileNotFoundError:  # the holder has just removed the directory
+        except (FileNotFoundError, FileExistsError):  # the holder has just removed the directory
+            if lock.parent.is_file():
+                raise
             continue
         try:
             _lock(file, wait)
