@@ -199,7 +199,13 @@ def view(withheld: bool, cc: float, noise: float | None, **more) -> dict:
 TEST = {"grain": 3.0, "white": False, "share": 0.5, "row": 20.0, "column": 36.0, "correlated": 0.3}
 SHIFTED = view(False, 0.99, 1.0, rms_predicted=1.0, residual_test={**TEST, "cause": "calibration"})
 PLAIN = view(False, 0.99, 1.0, rms_predicted=20.0, residual_test={**TEST, "cause": ""})
+UNCORRELATED = view(False, 0.99, 1.0, rms_predicted=1.0, residual_test={**TEST, "cause": "blur", "correlated": 0.0})
 FIT, GOOD = view(False, 0.99, 1.0), view(True, 0.99, 1.0)
+
+
+def test_residuals_without_a_correlated_part_are_no_statement(tmp_path):
+    found = statements(Result(tmp_path, metrics=Metrics(views=[UNCORRELATED, FIT, GOOD])))
+    assert not any("correlated" in s.text for s in found)
 
 
 @pytest.mark.parametrize(

@@ -270,7 +270,7 @@ def _of_residuals(result: Result) -> list[Statement]:
 
 
 def _of_correlated_residuals(result: Result) -> list[Statement]:
-    views = [v for v in _views(result, False) if not (v.get("residual_test") or {"white": True})["white"]]
+    views = [v for v in _views(result, False) if correlated_share(v) and not v["residual_test"]["white"]]
     if cut := cut_off(_views(result, False)):  # it leaves residuals of any pattern
         return [Statement("warning", f"{cut[0].upper()}{cut[1:]}.")]
     remarks = []
