@@ -13,7 +13,7 @@ from typing import Any, Literal
 from nerif.cli.arguments import ALIASES
 from nerif.cli.commands.settings import flat_names, help_of
 
-__all__ = ["GROUPS", "print_help"]
+__all__ = ["GROUPS", "after_help"]
 
 WIDTH, INDENT = 100, 26
 
@@ -29,8 +29,18 @@ GROUPS: dict[str, tuple[str, ...]] = {
 """Options that people set, by group."""
 
 
-def print_help(default: Any, prog: str) -> None:
-    """Print the help of a command: usage, the options of GROUPS, and where the others are."""
+def after_help(arguments: list[str], default: Any, prog: str) -> list[str]:
+    """Return the arguments for the parser, which prints every option; print the frequent ones of --help, and end."""
+    if arguments[-2:] == ["--help", "all"]:
+        return arguments[:-1]
+    if {"-h", "--help"} & {*arguments}:
+        print(_grouped(default, prog))
+        raise SystemExit(0)
+    return arguments
+
+
+def _grouped(default: Any, prog: str) -> str:
+    """Return the help of a command: usage, the options of GROUPS, and where the others are."""
     names, description = flat_names(type(default)), inspect.getdoc(type(default)) or ""
     lines = [
         f"usage: {prog} MEASUREMENT --out OUT [options]",
@@ -45,7 +55,7 @@ def print_help(default: Any, prog: str) -> None:
         "--help all lists every option. Any of them can also be given as --set NAME=VALUE, such as",
         "--set network.width=128, or in a settings file: --config FILE.toml.",
     ]
-    print("\n".join(lines))
+    return "\n".join(lines)
 
 
 def _option(default: Any, place: tuple[str, ...]) -> list[str]:

@@ -15,7 +15,7 @@ import psutil
 import tyro
 
 from nerif.cli.arguments import flag_value
-from nerif.cli.commands.help import print_help
+from nerif.cli.commands.help import after_help
 from nerif.cli.commands.output import MONITOR
 from nerif.cli.commands.settings import Flat, Settings, read_settings, setting_of
 from nerif.common.conventions import InputError
@@ -145,9 +145,7 @@ def main(arguments: list[str]) -> None:
     if method == "nerif":
         name = setting_of("preset", arguments, "auto", file)
         defaults |= {"preset": name, "reconstructor": preset(name)}
-    if arguments[-2:] == ["--help", "all"]:
-        arguments = arguments[:-1]
-    elif {"-h", "--help"} & set(arguments):
-        return print_help(command(**defaults), "nerif reconstruct")
-    if run(read_settings(command(**defaults), arguments, "reconstruct", file)).outcome.failed:
+    default = command(**defaults)
+    arguments = after_help(arguments, default, "nerif reconstruct")
+    if run(read_settings(default, arguments, "reconstruct", file)).outcome.failed:
         raise SystemExit(1)

@@ -10,7 +10,7 @@ import tyro
 from annotated_types import Ge
 
 from nerif.cli.commands import velocity
-from nerif.cli.commands.help import print_help
+from nerif.cli.commands.help import after_help
 from nerif.cli.commands.output import MONITOR, figures_bar
 from nerif.cli.commands.settings import Flat, Settings, read_settings, setting_of
 from nerif.reconstruction.neural.neural import NeRIF
@@ -89,10 +89,7 @@ def main(arguments: list[str]) -> None:
     name = setting_of("preset", arguments, "auto")
     reconstructor = preset(name)
     default = Sequence(tyro.MISSING, tyro.MISSING, preset=name, reconstructor=reconstructor)
-    if arguments[-2:] == ["--help", "all"]:
-        arguments = arguments[:-1]
-    elif {"-h", "--help"} & set(arguments):
-        return print_help(default, "nerif sequence")
+    arguments = after_help(arguments, default, "nerif sequence")
     status = run(read_settings(default, arguments, "sequence")).status
     if (status == MISSING).any() or not (status == DONE).any():
         raise SystemExit(1)
