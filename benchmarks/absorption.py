@@ -20,11 +20,11 @@ import torch
 from benchmarks.runner import Settings, peer, ratios
 from nerif.analysis.evaluation import evaluate_volume
 from nerif.data.measurement import Measurement
-from nerif.fields.base import Field
-from nerif.fields.grid import VoxelField
+from nerif.fields.field import Field
+from nerif.fields.voxel_field import VoxelField
 from nerif.geometry import Box, Grid, Ring
-from nerif.reconstruction.base import Reconstructor
 from nerif.reconstruction.neural.neural import NeRIF
+from nerif.reconstruction.reconstructor import Reconstructor
 from nerif.reconstruction.voxels.multiplicative import MLEM
 from nerif.reconstruction.voxels.total_variation import TotalVariation
 from nerif.simulation.simulate import Simulation

@@ -26,10 +26,10 @@ from torch import Tensor
 
 from benchmarks.runner import ROOT, Settings, Unavailable
 from nerif.data.measurement import Measurement
-from nerif.fields.base import Field
+from nerif.fields.field import Field
 from nerif.geometry import Box, Grid, Ring
-from nerif.reconstruction.base import Reconstructor
 from nerif.reconstruction.neural.presets import preset
+from nerif.reconstruction.reconstructor import Reconstructor
 from nerif.reconstruction.voxels.total_variation import TotalVariation
 from nerif.simulation.simulate import simulate
 from nerif.workflow.job import Run

@@ -22,9 +22,9 @@ from nerif.data.volume import Volume
 from nerif.data.volume_file import read_volume, write_netcdf
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Grid, Ring
-from nerif.reconstruction.base import Reconstructor
-from nerif.reconstruction.gaussian_process import GaussianProcess
+from nerif.reconstruction.detail.gaussian_process import GaussianProcess
 from nerif.reconstruction.neural.presets import preset
+from nerif.reconstruction.reconstructor import Reconstructor
 from nerif.reconstruction.voxels.total_variation import TotalVariation
 from nerif.results.directory import ResultDirectory
 from nerif.simulation.simulate import simulate

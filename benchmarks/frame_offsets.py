@@ -19,9 +19,9 @@ from nerif.analysis.film_check import Excerpt, frame_shifts
 from nerif.analysis.prediction import predict
 from nerif.common.arrays import Points, Values, Vectors
 from nerif.data.measurement import Measurement
-from nerif.fields.base import Field
-from nerif.fields.grid import VoxelField
+from nerif.fields.field import Field
 from nerif.fields.turbulence import TurbulentPlume
+from nerif.fields.voxel_field import VoxelField
 from nerif.geometry import Box, Grid, Ring
 
 BOX, NOISE = Box.cube(50.0), 0.05

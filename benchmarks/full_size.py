@@ -18,10 +18,10 @@ from nerif.analysis.evaluation import evaluate_volume
 from nerif.analysis.prediction import predict
 from nerif.data.measurement import Measurement
 from nerif.data.volume import Volume
-from nerif.fields.grid import VoxelField
 from nerif.fields.phantoms import make_phantom
+from nerif.fields.voxel_field import VoxelField
 from nerif.geometry import Box, Grid, paper_rig
-from nerif.reconstruction.neural import bins
+from nerif.reconstruction import bins
 from nerif.reconstruction.neural.presets import preset as settings_of
 from nerif.simulation.simulate import add_noise
 

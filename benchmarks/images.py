@@ -21,7 +21,7 @@ from nerif.analysis.prediction import predict
 from nerif.data.measurement import Measurement
 from nerif.data.volume import Volume
 from nerif.data.volume_file import read_volume, write_netcdf
-from nerif.fields.base import Field
+from nerif.fields.field import Field
 from nerif.fields.phantoms import Scaled, make_phantom
 from nerif.geometry import Grid, Lens, paper_rig
 from nerif.imaging.displacement.displacement import DisplacementSettings

@@ -16,7 +16,7 @@ import torch
 from benchmarks.random_flows import EDGE, random_flow
 from benchmarks.runner import N_AMBIENT
 from nerif.data.measurement import Measurement
-from nerif.fields.base import Field
+from nerif.fields.field import Field
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Camera, Ring
 from nerif.geometry.pose import GEOMETRY, Corrections

@@ -18,12 +18,12 @@ from nerif.data.measurement import Measurement
 from nerif.data.volume import Volume
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Grid, paper_rig
-from nerif.reconstruction.base import Reconstructor
 from nerif.reconstruction.neural.presets import preset
+from nerif.reconstruction.reconstructor import Reconstructor
 from nerif.reconstruction.voxels.landweber import Landweber
-from nerif.reconstruction.voxels.settings import VoxelReconstructor
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.reconstruction.voxels.total_variation import TotalVariation
+from nerif.reconstruction.voxels.voxel_reconstructor import VoxelReconstructor
 from nerif.simulation.simulate import add_noise, simulate
 
 COLUMNS = {

@@ -24,8 +24,8 @@ from nerif.data.volume import Volume
 from nerif.fields.jets import AXISYMMETRIC
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Camera, Grid, Ring
-from nerif.reconstruction.base import Reconstructor
 from nerif.reconstruction.neural.neural import NeRIF
+from nerif.reconstruction.reconstructor import Reconstructor
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.reconstruction.voxels.total_variation import TotalVariation
 from nerif.simulation.simulate import add_noise, simulate

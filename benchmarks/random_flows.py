@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from nerif.common.arrays import Points, Values, Vectors
-from nerif.fields.base import Field
-from nerif.fields.grid import VoxelField
+from nerif.fields.field import Field
 from nerif.fields.turbulence import inertial_scalar
+from nerif.fields.voxel_field import VoxelField
 from nerif.geometry import Box
 
 CONTRAST = 2.2e-4

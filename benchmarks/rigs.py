@@ -23,7 +23,7 @@ from nerif.data.measurement import Measurement
 from nerif.data.volume_file import read_volume
 from nerif.reconstruction.aperture import apply_aperture
 from nerif.reconstruction.neural.neural import NeRIF
-from nerif.reconstruction.rig.parameters import with_corrections
+from nerif.reconstruction.rig_parameters import with_corrections
 from nerif.reconstruction.shared_settings import Aperture, Source
 from nerif.reconstruction.sources import of_source
 from nerif.reconstruction.voxels.total_variation import TotalVariation

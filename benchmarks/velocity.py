@@ -31,17 +31,17 @@ from nerif.data.measurement_sequence import MeasurementSequence
 from nerif.data.velocity_sequence import COMPONENTS, VelocitySequence
 from nerif.data.volume import Volume
 from nerif.data.volume_sequence import VolumeSequence
-from nerif.fields.grid import VoxelField
+from nerif.fields.voxel_field import VoxelField
+from nerif.flow.advected_scalar import between
+from nerif.flow.assimilation import VelocityFit
+from nerif.flow.periodic_box import PeriodicBox
 from nerif.geometry import Box, Grid, Ring
 from nerif.reconstruction.neural.presets import preset
-from nerif.reconstruction.velocity.assimilation import VelocityFit
-from nerif.reconstruction.velocity.between import between
-from nerif.reconstruction.velocity.periodic_box import PeriodicBox
-from nerif.simulation.particles.velocity import Velocity, velocity_between
+from nerif.simulation.particles.particle_velocity import Velocity, velocity_between
 from nerif.simulation.simulate import simulate
+from nerif.workflow.film_velocity import densities, velocity_of_film
 from nerif.workflow.sequence.plan import SequenceSettings
-from nerif.workflow.sequence.reconstruct import reconstruct_sequence
-from nerif.workflow.velocity import densities, velocity_of_film
+from nerif.workflow.sequence.reconstruct_sequence import reconstruct_sequence
 
 COLUMNS = {
     "density": "{density}", "method": "{method}", "frames": "{frames}", "interval": "{interval:.0f} ms",

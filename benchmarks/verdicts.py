@@ -21,11 +21,11 @@ from nerif.analysis.verdict import RATINGS, Verdict, verdict
 from nerif.data.volume import Volume
 from nerif.data.volume_file import write_netcdf
 from nerif.geometry import Grid
-from nerif.reconstruction.base import Reconstructor
 from nerif.reconstruction.neural.neural import NeRIF
+from nerif.reconstruction.reconstructor import Reconstructor
 from nerif.reconstruction.voxels.total_variation import TotalVariation
 from nerif.results.directory import Result, ResultDirectory
-from nerif.results.metrics import Metrics
+from nerif.results.metrics_file import Metrics
 from nerif.workflow.pipeline import Run, reconstruct_into
 
 BAD, GOOD = 0.05, 0.02  # of the variation

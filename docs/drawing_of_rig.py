@@ -10,8 +10,8 @@ from torch import Tensor
 from nerif.analysis.prediction import predict
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Camera, paper_rig
-from nerif.reconstruction.rig.posterior import covariance
-from nerif.reconstruction.rig.refinement import Refinement
+from nerif.reconstruction.rig_refinement import Refinement
+from nerif.reconstruction.uncertainty.rig_posterior import covariance
 from nerif.simulation.simulate import add_noise
 
 BLUE, ORANGE, INK, PALE = "#0072B2", "#E69F00", "#222222", "#DDDDDD"

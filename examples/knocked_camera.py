@@ -17,7 +17,7 @@ from pathlib import Path
 import torch
 
 from nerif.cli.cli import main
-from nerif.imaging.calibration.cameras_file import read_cameras, write_cameras
+from nerif.data.cameras_file import read_cameras, write_cameras
 
 KNOCKED, BY = "85deg", (0.3, 0.0, 0.0)  # mm along the camera's own axes
 SIGMA = ("--pose-sigma-mm", 0.05, "--pose-sigma-deg", 0.005)  # as well as a bench as this holds its cameras

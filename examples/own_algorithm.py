@@ -13,7 +13,7 @@ import argparse
 import torch
 
 import nerif
-from nerif.fields.base import Field
+from nerif.fields.field import Field
 
 
 def landweber(A: nerif.Projector, iterations: int = 100) -> torch.Tensor:

@@ -17,10 +17,10 @@ import numpy as np
 from nerif.geometry import Grid
 from nerif.reconstruction.voxels.multiplicative import MART
 from nerif.simulation.particles.cloud import Particles, quality_factor
-from nerif.simulation.particles.images import images
-from nerif.simulation.particles.rig import four_cameras
+from nerif.simulation.particles.particle_images import images
+from nerif.simulation.particles.particle_rig import four_cameras
+from nerif.simulation.particles.particle_velocity import velocity_between
 from nerif.simulation.particles.ring import VortexRing
-from nerif.simulation.particles.velocity import velocity_between
 
 parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
 parser.add_argument("out", type=Path, nargs="?", default=Path("out/particles"), help="directory for the results")

@@ -18,7 +18,7 @@ import xarray as xr
 from line_scans import LineScan, ScanEstimate
 
 from nerif import Measurement, NeRIF, TotalVariation, reproject
-from nerif.reconstruction.base import Reconstruction, Reconstructor
+from nerif.reconstruction.reconstructor import Reconstruction, Reconstructor
 
 WITHHELD = (2, 7, 12, 17)
 WEIGHTS = (5e-5, 1e-4, 2e-4, 5e-4, 1e-3, 2e-3, 5e-3)  # of total variation, to choose from

@@ -34,12 +34,12 @@ if os.environ.get(
     install_import_hook([f"nerif.{part}" for part in CHECKED], "typecheck.check")
 
 from nerif.data.measurement import Measurement
-from nerif.fields.base import Field
+from nerif.fields.field import Field
 from nerif.fields.phantoms import GaussianBalls
 from nerif.geometry import Box, Camera, Ring
 from nerif.reconstruction.neural import schedule
 from nerif.reconstruction.neural.trainer import Trainer
-from nerif.reconstruction.voxels.settings import VoxelReconstructor
+from nerif.reconstruction.voxels.voxel_reconstructor import VoxelReconstructor
 from nerif.simulation.simulate import simulate
 
 torch.set_num_threads(1)  # tests run side by side

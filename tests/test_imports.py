@@ -38,7 +38,7 @@ def loaded_by(statement: str, after: str = "") -> set[str]:
 
 
 def test_core_imports_torch_and_numpy_only():
-    core = "import nerif.geometry, nerif.fields.phantoms, nerif.fields.network, nerif.fields.grid\n"
+    core = "import nerif.geometry, nerif.fields.phantoms, nerif.fields.network, nerif.fields.voxel_field\n"
     core += "import nerif.simulation.simulate\n"
     core += "import nerif.physics.gas_optics, nerif.forward.ray_tracing, nerif.reconstruction.neural.presets\n"
     core += "import nerif.reconstruction.voxels.operator, nerif.reconstruction.voxels.total_variation\n"

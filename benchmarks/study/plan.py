@@ -13,11 +13,11 @@ from benchmarks.runner import N_AMBIENT
 from nerif import __version__
 from nerif.forward.deflection import MODELS
 from nerif.geometry import Box, Ring
-from nerif.reconstruction.base import Reconstructor
 from nerif.reconstruction.device import resolve_device
 from nerif.reconstruction.neural.losses import LossWeights
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.neural.presets import PRESETS, preset
+from nerif.reconstruction.reconstructor import Reconstructor
 from nerif.reconstruction.voxels.landweber import Landweber
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.reconstruction.voxels.total_variation import TotalVariation

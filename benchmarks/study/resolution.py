@@ -30,7 +30,7 @@ from torch import Tensor
 
 from benchmarks.study.mtf import COARSEST, MTF
 from nerif.common.conventions import InputError
-from nerif.fields.base import Field, in_chunks
+from nerif.fields.field import Field, in_chunks
 from nerif.fields.phantoms import Octahedron
 from nerif.geometry import Camera
 

@@ -17,13 +17,13 @@ from nerif.analysis.metrics import volume_errors
 from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
 from nerif.data.volume import Volume
-from nerif.fields.base import Field
+from nerif.fields.field import Field
 from nerif.fields.phantoms import Octahedron, make_phantom
 from nerif.forward.deflection import MODELS
 from nerif.forward.path_integral import PathIntegral, project
 from nerif.geometry import Grid
-from nerif.reconstruction.base import Reconstruction, State, Step
 from nerif.reconstruction.neural.neural import NeRIF
+from nerif.reconstruction.reconstructor import Reconstruction, State, Step
 from nerif.simulation.simulate import add_noise, simulate
 
 FORWARD_RAYS, FORWARD_SAMPLES = 4000, 400

@@ -15,7 +15,7 @@ simulated.
 import torch
 
 import nerif
-from nerif.fields.base import Field
+from nerif.fields.field import Field
 from nerif.geometry import Box, Ring
 
 
@@ -85,7 +85,7 @@ _ = axes.legend()
 # -----------
 # The density on the plate, as ``nerif reconstruct`` writes it to ``surface.vtp`` for ParaView and draws it in the
 # report.
-from nerif.analysis.surface import surface_map
+from nerif.analysis.wall_values import surface_map
 from nerif.report.surface_figure import draw_surface
 
 surface = surface_map(result.field, result.bodies, box, result.n_ambient, edge=0.8)

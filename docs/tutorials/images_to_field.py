@@ -65,7 +65,7 @@ for i, name in enumerate(calibration.names):
 # -------------
 # The shift of the pattern between reference and flow, by window correlation, and its noise from the reference images.
 # ``nerif displacement experiment --calibration calibration.toml -o m.nc``.
-from nerif.imaging.calibration.cameras_file import read_cameras
+from nerif.data.cameras_file import read_cameras
 from nerif.imaging.recording import Recording, Scene, Surroundings, measure_instant
 
 calibration.write(folder / "calibration.toml", box)

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import torch
 
 import nerif
-from nerif.forward.base import ForwardModel, Weights
+from nerif.forward.forward_model import ForwardModel, Weights
 from nerif.forward.registry import TECHNIQUES
 
 

@@ -49,8 +49,8 @@ for k, frame in enumerate(frames):
 # ------------
 # No gravity drives this flow, so its momentum is left open. In Python and at the command line:
 # ``nerif velocity film.zarr -o velocity.zarr --physics transport``.
-from nerif.reconstruction.velocity.assimilation import VelocityFit
-from nerif.workflow.velocity import velocity_of_film
+from nerif.flow.assimilation import VelocityFit
+from nerif.workflow.film_velocity import velocity_of_film
 
 fit = VelocityFit(
     physics="transport", diffusivity=0.01, resolution=24, max_iterations=40, samples=3

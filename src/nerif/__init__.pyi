@@ -24,10 +24,10 @@ from .geometry import Ring as Ring
 from .geometry import paper_rig as paper_rig
 from .physics.quantities import GasSettings as GasSettings
 from .physics.quantities import derive as derive
-from .reconstruction.base import Reconstruction as Reconstruction
 from .reconstruction.neural.neural import NeRIF as NeRIF
 from .reconstruction.neural.presets import preset as preset
 from .reconstruction.projector import Projector as Projector
+from .reconstruction.reconstructor import Reconstruction as Reconstruction
 from .reconstruction.voxels.landweber import Landweber as Landweber
 from .reconstruction.voxels.multiplicative import MART as MART
 from .reconstruction.voxels.multiplicative import MLEM as MLEM
@@ -42,6 +42,6 @@ from .workflow.job import Run as Run
 from .workflow.pipeline import reconstruct_into as reconstruct_into
 from .workflow.reports import write_report as write_report
 from .workflow.sequence.plan import SequenceSettings as SequenceSettings
-from .workflow.sequence.reconstruct import reconstruct_sequence as reconstruct_sequence
+from .workflow.sequence.reconstruct_sequence import reconstruct_sequence as reconstruct_sequence
 
 __version__: str

@@ -14,8 +14,8 @@ from scipy.ndimage import gaussian_filter
 from nerif.analysis.evaluation import evaluate_views, evaluate_volume
 from nerif.analysis.prediction import predict, predict_view, reproject
 from nerif.data.volume import Volume
-from nerif.fields.grid import Boundary, VoxelField
 from nerif.fields.phantoms import GaussianBalls
+from nerif.fields.voxel_field import Boundary, VoxelField
 from nerif.forward.deflection import MODELS
 from nerif.forward.path_integral import PathIntegral, project
 from nerif.geometry import Grid, Ring

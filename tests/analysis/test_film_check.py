@@ -15,7 +15,7 @@ from nerif.analysis.prediction import predict
 from nerif.cli.cli import main
 from nerif.data.measurement import Measurement
 from nerif.data.measurement_sequence import MeasurementSequence
-from nerif.fields.grid import VoxelField
+from nerif.fields.voxel_field import VoxelField
 from nerif.geometry import Box, Grid, Ring
 
 BOX, N_AMBIENT, FRAMES = Box.cube(50.0), 1.00027, 14

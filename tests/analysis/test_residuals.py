@@ -12,7 +12,7 @@ from nerif.analysis.prediction import predict
 from nerif.analysis.residuals import COARSE, white_noise, whiteness
 from nerif.data.measurement import Measurement
 from nerif.data.volume_file import read_volume
-from nerif.fields.grid import VoxelField
+from nerif.fields.voxel_field import VoxelField
 
 RIGS = Path(__file__).parents[3] / "shared" / "data" / "rigs"
 SHAPE, SIGMA = (96, 80), 0.05

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from bodies import ball, cuboid
-from nerif.analysis.surface import surface_map
+from nerif.analysis.wall_values import surface_map
 from nerif.data.surface import SurfaceMap
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box
@@ -51,7 +51,7 @@ def test_the_surface_has_the_index_of_the_field_and_its_density(surface):
 
 
 def test_a_large_surface_has_larger_triangles(monkeypatch):
-    monkeypatch.setattr("nerif.analysis.surface.MOST_TRIANGLES", 3000)
+    monkeypatch.setattr("nerif.analysis.wall_values.MOST_TRIANGLES", 3000)
     large = surface_map(make_phantom("gaussians", BOX, 0), [ball(15.0)], BOX, N_AMBIENT, 0.2)
     assert 1000 < len(large.faces) < 12000
 

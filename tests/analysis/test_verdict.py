@@ -17,7 +17,7 @@ from nerif.geometry import Box, Grid, Ring
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.report.summary import headline
 from nerif.results.directory import Gap, Result, ResultDirectory
-from nerif.results.metrics import Metrics
+from nerif.results.metrics_file import Metrics
 from nerif.simulation.simulate import simulate
 from nerif.workflow.job import Run
 from nerif.workflow.pipeline import reconstruct_into

@@ -20,8 +20,8 @@ from app.test_pages import visit
 from app.test_results import result
 from nerif.app.frame import Page
 from nerif.app.pages import PAGES
+from nerif.data.cameras_file import CalibratedCamera, write_cameras
 from nerif.geometry import Ring
-from nerif.imaging.calibration.cameras_file import CalibratedCamera, write_cameras
 from nerif.simulation.simulate import Simulation
 from report.browsing import errors, needs_browser, requests, wait_for
 

@@ -14,9 +14,9 @@ from app.test_pages import line, put
 from calibration_images import target_images
 from nerif.app.pages.calibration import form_of
 from nerif.cli.cli import main
+from nerif.data.cameras_file import read_cameras
 from nerif.geometry import Ring
 from nerif.imaging.calibration.calibrate import calibrate
-from nerif.imaging.calibration.cameras_file import read_cameras
 from nerif.imaging.calibration.targets import CalibrationTarget
 from report.browsing import errors, needs_browser, wait_for
 

@@ -29,9 +29,9 @@ from nerif.cli.commands.check import Check
 from nerif.cli.commands.design import Design
 from nerif.cli.commands.displacement import Displacement
 from nerif.common.files import read_toml
+from nerif.data.cameras_file import CalibratedCamera, write_cameras
 from nerif.geometry import Ring
 from nerif.geometry.camera import Camera
-from nerif.imaging.calibration.cameras_file import CalibratedCamera, write_cameras
 from nerif.results.directory import ResultDirectory
 from nerif.simulation.simulate import Simulation
 from refusals import refused

@@ -24,12 +24,12 @@ from nerif.data.velocity_sequence import VelocitySequence
 from nerif.data.volume import Volume
 from nerif.data.volume_file import read_volumes
 from nerif.data.volume_sequence import VolumeSequence
-from nerif.fields.grid import VoxelField
 from nerif.fields.phantoms import Flame
+from nerif.fields.voxel_field import VoxelField
 from nerif.geometry import Box, Grid
-from nerif.reconstruction.base import Outcome, Reconstruction
+from nerif.reconstruction.reconstructor import Outcome, Reconstruction
 from nerif.results.directory import ResultDirectory
-from nerif.results.metrics import Metrics
+from nerif.results.metrics_file import Metrics
 from refusals import refused
 from report.browsing import errors, needs_browser, requests, text, wait_for
 

@@ -16,9 +16,9 @@ from benchmarks.study.mtf import draw_mtf
 from benchmarks.study.octahedron_figures import draw_distribution, draw_edge_spread
 from benchmarks.study.resolution import Resolution, from_plain, measure_resolution, pixels_per_unit, to_plain
 from nerif.common.files import write_json
-from nerif.fields.base import Field
-from nerif.fields.grid import VoxelField
+from nerif.fields.field import Field
 from nerif.fields.phantoms import Octahedron
+from nerif.fields.voxel_field import VoxelField
 from nerif.geometry import Box, Grid, Ring
 from refusals import refused
 

@@ -11,11 +11,11 @@ import torch
 from benchmarks.study.plan import FULL, METHODS, NOISES, PHANTOMS, QUICK, SECTIONS, Case, study_cases
 from benchmarks.study.running import run_case
 from nerif.common.conventions import InputError
-from nerif.fields.base import Field
+from nerif.fields.field import Field
 from nerif.fields.network import NetworkShape
 from nerif.geometry import Box, Ring
-from nerif.reconstruction.base import Outcome, Reconstruction
 from nerif.reconstruction.neural.neural import NeRIF
+from nerif.reconstruction.reconstructor import Outcome, Reconstruction
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 
 RING = Ring(views=4, image_size=(16, 16), pixel_pitch=0.25)

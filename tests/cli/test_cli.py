@@ -24,7 +24,7 @@ from nerif.cli.cli import COMMANDS
 from nerif.data.measurement import Measurement
 from nerif.data.volume_file import read_volume
 from nerif.forward.deflection import MODELS
-from nerif.reconstruction.files import read_field
+from nerif.reconstruction.field_files import read_field
 
 TINY = str.split("--image-size 18 22 --pixel-pitch 0.2 --views 4 --steps 40 --truth-voxels 16")
 QUICK = str.split("""--network.depth 2 --network.width 24 --network.octaves 2 --network.directions 3 --max-steps 40

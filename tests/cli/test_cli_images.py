@@ -15,10 +15,10 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from commands import metrics_of, run
+from nerif.data.cameras_file import read_cameras
 from nerif.data.measurement import Measurement
 from nerif.data.volume_file import read_volume
 from nerif.fields.phantoms import make_phantom
-from nerif.imaging.calibration.cameras_file import read_cameras
 from nerif.simulation.simulate import view_displacement
 
 BOX = str.split("--lower -25 -25 -25 --upper 25 25 25")

@@ -19,8 +19,8 @@ import xarray as xr
 
 from commands import metrics_of, run
 from nerif.data.measurement import Measurement
-from nerif.fields.grid import VoxelField
-from nerif.reconstruction.files import read_field
+from nerif.fields.voxel_field import VoxelField
+from nerif.reconstruction.field_files import read_field
 from nerif.reconstruction.methods import METHODS
 
 TINY = str.split("--image-size 18 22 --pixel-pitch 0.2 --views 5 --steps 40 --truth-voxels 16")

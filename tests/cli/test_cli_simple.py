@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from commands import run
+from nerif.data.cameras_file import read_box, read_cameras
 from nerif.data.measurement import Measurement
 from nerif.geometry import Box
-from nerif.imaging.calibration.cameras_file import read_box, read_cameras
 
 DISTANCES = str.split("--simple --distance 700 --background-distance 300")
 LENS = str.split("--focal-length 50 --pixel-pitch-um 50")

@@ -17,11 +17,11 @@ import xarray as xr
 from commands import metrics_of, run
 from nerif.data.volume import Volume
 from nerif.data.volume_file import read_volumes, write_netcdf
-from nerif.fields.grid import VoxelField
+from nerif.fields.voxel_field import VoxelField
 from nerif.geometry import Box, Grid
-from nerif.reconstruction.base import Outcome
+from nerif.reconstruction.reconstructor import Outcome
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
-from nerif.report.pages import slices
+from nerif.report.journal_figures import slices
 
 RIG = str.split("--image-size 14 18 --pixel-pitch 0.25 --views 4 --steps 30 --truth-voxels 12")
 QUICK = str.split("--method tikhonov --voxels 10 --basis linear --iterations 20 --regularisation 0.01")

@@ -19,6 +19,7 @@ from commands import run
 from nerif.common.conventions import InputError
 from nerif.common.files import write_toml
 from nerif.data import kinds
+from nerif.data.cameras_file import FORMAT
 from nerif.data.exports import export
 from nerif.data.kinds import Kind, check_kind, kind_of
 from nerif.data.measurement import Measurement
@@ -29,9 +30,8 @@ from nerif.data.volume_file import read_volume
 from nerif.data.volume_sequence import VolumeSequence
 from nerif.fields.network import NetworkShape
 from nerif.geometry import Grid
-from nerif.imaging.calibration.cameras_file import FORMAT
 from nerif.imaging.readers.views import find_views
-from nerif.reconstruction.files import CHECKPOINT
+from nerif.reconstruction.field_files import CHECKPOINT
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.results.directory import ResultDirectory
 from nerif.workflow.sequence.store import SequenceStore

@@ -15,14 +15,14 @@ from torch import Tensor
 from commands import metrics_of, run
 from nerif.app.pages.reconstruct import form_of, titles
 from nerif.data.measurement import Measurement
-from nerif.fields.base import Field
-from nerif.reconstruction.base import OnStep, Reconstruction, State
-from nerif.reconstruction.files import read_field
+from nerif.fields.field import Field
+from nerif.reconstruction.field_files import read_field
 from nerif.reconstruction.methods import METHODS
+from nerif.reconstruction.reconstructor import OnStep, Reconstruction, State
 from nerif.reconstruction.shared_settings import SharedSettings, Source
-from nerif.reconstruction.voxels.problem import Iterate, Problem
-from nerif.reconstruction.voxels.settings import VoxelReconstructor
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
+from nerif.reconstruction.voxels.voxel_problem import Iterate, Problem
+from nerif.reconstruction.voxels.voxel_reconstructor import VoxelReconstructor
 from nerif.results.directory import ResultDirectory
 
 DOCS = Path(__file__).parents[2] / "docs"

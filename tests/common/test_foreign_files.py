@@ -16,16 +16,16 @@ from nerif.common.conventions import InputError
 from nerif.common.files import read_json, read_toml, read_yaml, write_toml
 from nerif.common.image_names import SUFFIXES
 from nerif.data.body_file import read_body
+from nerif.data.cameras_file import CalibratedCamera, write_cameras
 from nerif.data.measurement import Measurement
 from nerif.data.volume_file import read_volume
 from nerif.data.vti import write_vti
 from nerif.geometry import Box, Grid, Ring
-from nerif.imaging.calibration.cameras_file import CalibratedCamera, write_cameras
 from nerif.imaging.calibration.importers.importers import import_cameras
 from nerif.imaging.readers.open import open_frames
 from nerif.imaging.readers.views import find_views
-from nerif.reconstruction.files import read_tensors
-from nerif.results.metrics import Metrics
+from nerif.reconstruction.field_files import read_tensors
+from nerif.results.metrics_file import Metrics
 
 DEEP = 200_000
 NESTED = {

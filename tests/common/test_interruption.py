@@ -17,9 +17,9 @@ from nerif.cli.commands import info, output, simulate
 from nerif.cli.commands.output import MONITOR, counting_bar
 from nerif.common.files import atomic, written
 from nerif.common.interruption import Interrupted, if_interrupted
-from nerif.reconstruction.base import Step
-from nerif.reconstruction.files import CHECKPOINT, FIELD
+from nerif.reconstruction.field_files import CHECKPOINT, FIELD
 from nerif.reconstruction.progress import Monitor
+from nerif.reconstruction.reconstructor import Step
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.results.directory import ResultDirectory
 from nerif.workflow import job, steps

@@ -19,7 +19,7 @@ from nerif.data.volume import Volume
 from nerif.data.volume_sequence import VolumeSequence
 from nerif.geometry import Box, Grid, Ring
 from nerif.imaging.readers.open import open_frames
-from nerif.workflow.velocity import velocity_of_film
+from nerif.workflow.film_velocity import velocity_of_film
 
 TIMES = (0.0, 0.004, 0.008, 0.016)
 BOX = Box.cube(50.0)

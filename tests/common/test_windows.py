@@ -24,9 +24,9 @@ from nerif.common import files, installation
 from nerif.common.installation import command_line
 from nerif.common.interruption import interrupt
 from nerif.imaging.masks import MaskShape, write_masks
-from nerif.reconstruction.base import State
 from nerif.reconstruction.device import peak_memory
-from nerif.reconstruction.files import CHECKPOINT, read_state, write_state
+from nerif.reconstruction.field_files import CHECKPOINT, read_state, write_state
+from nerif.reconstruction.reconstructor import State
 from refusals import refused
 
 SOURCE = Path(__file__).parents[2] / "src" / "nerif"

@@ -21,7 +21,7 @@ from nerif.data.volume_sequence import FIELDS
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Ring
 from nerif.results.directory import CALIBRATION, FIGURES, METRICS, REPORT, RUN, ResultDirectory
-from nerif.results.metrics import Metrics
+from nerif.results.metrics_file import Metrics
 from nerif.simulation.experiment import Experiment
 from refusals import refused
 from sequence_films import QUICK, simulated

@@ -13,7 +13,7 @@ import nerif
 from nerif.analysis.consistency_file import read_findings
 from nerif.data.measurement_sequence import MeasurementSequence
 from nerif.data.volume_sequence import VolumeSequence
-from nerif.reconstruction import files
+from nerif.reconstruction import field_files as files
 from refusals import refused
 
 ARCHIVES = sorted(Path(__file__).parent.glob("*.tar.gz"))

@@ -19,10 +19,10 @@ import nerif
 from nerif.app.project import OWN, Project
 from nerif.app.workspace import Workspace
 from nerif.cli.cli import main
+from nerif.data.cameras_file import CalibratedCamera, write_cameras
 from nerif.fields.network import NetworkShape
 from nerif.geometry import Box, Grid, Ring
-from nerif.imaging.calibration.cameras_file import CalibratedCamera, write_cameras
-from nerif.reconstruction.files import CHECKPOINT
+from nerif.reconstruction.field_files import CHECKPOINT
 
 POINTS = [[0.0, 0.0, 0.0], [3.0, -2.0, 4.0], [-6.0, 5.0, -3.0]]  # mm
 PROJECT: dict[str, Any] = {

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import nerif
-from nerif.imaging.calibration.cameras_file import CalibratedCamera
+from nerif.data.cameras_file import CalibratedCamera
 from refusals import refused
 
 

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from nerif.common.conventions import FACES
-from nerif.fields import grid
-from nerif.fields.grid import Boundary, VoxelField, spline_weights
+from nerif.fields import voxel_field as grid
+from nerif.fields.voxel_field import Boundary, VoxelField, spline_weights
 from nerif.geometry import Box, Grid
 from refusals import refused
 

@@ -21,9 +21,9 @@ from nerif.fields.network import (
     wave_vectors,
 )  # fmt: skip
 from nerif.geometry import Box
-from nerif.reconstruction.base import Outcome, Reconstruction
-from nerif.reconstruction.files import FIELD, read_field, write_field
+from nerif.reconstruction.field_files import FIELD, read_field, write_field
 from nerif.reconstruction.neural.presets import PRESETS
+from nerif.reconstruction.reconstructor import Outcome, Reconstruction
 from refusals import refused
 
 BASE = NetworkShape(depth=3, width=11, octaves=2, skip=2, head_width=5, gradient_head=True)

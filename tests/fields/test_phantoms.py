@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from nerif.fields.grid import VoxelField
 from nerif.fields.jets import AXISYMMETRIC
 from nerif.fields.phantoms import FLAME_INTERVAL, Flame, GaussianBalls, Octahedron, make_phantom
 from nerif.fields.turbulence import LONGEST, Fire, TurbulentPlume, inertial_scalar
+from nerif.fields.voxel_field import VoxelField
 from nerif.forward.deflection import MODELS
 from nerif.forward.path_integral import PathIntegral
 from nerif.geometry import Box, Grid, Rays, paper_rig

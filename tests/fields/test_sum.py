@@ -6,16 +6,16 @@ import pytest
 import torch
 
 from nerif.analysis.prediction import predict, reproject
-from nerif.fields.grid import VoxelField
 from nerif.fields.network import Network, NetworkShape, NeuralField
 from nerif.fields.phantoms import make_phantom
 from nerif.fields.sum import SumField
 from nerif.fields.symmetric import symmetry_of_field
+from nerif.fields.voxel_field import VoxelField
 from nerif.forward.path_integral import PathIntegral, project
 from nerif.forward.registry import forward_models
 from nerif.geometry import Box, Grid
-from nerif.reconstruction.base import Outcome, Reconstruction
-from nerif.reconstruction.files import read_field, write_field
+from nerif.reconstruction.field_files import read_field, write_field
+from nerif.reconstruction.reconstructor import Outcome, Reconstruction
 
 BOX = Box((-12.0, -10.0, -8.0), (12.0, 10.0, 8.0))
 

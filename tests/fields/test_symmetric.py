@@ -5,14 +5,14 @@ from __future__ import annotations
 import pytest
 import torch
 
-from nerif.fields.grid import Boundary, VoxelField
 from nerif.fields.network import NetworkShape, NeuralField
 from nerif.fields.symmetric import SymmetricNetwork, SymmetricVoxels
+from nerif.fields.voxel_field import Boundary, VoxelField
 from nerif.geometry import Box, Grid
 from nerif.geometry.symmetry import Symmetry
-from nerif.reconstruction.base import Outcome, Reconstruction
-from nerif.reconstruction.files import read_field, write_field
+from nerif.reconstruction.field_files import read_field, write_field
 from nerif.reconstruction.neural.fused import value_and_gradient
+from nerif.reconstruction.reconstructor import Outcome, Reconstruction
 from refusals import refused
 
 BOX = Box.cube(40.0)

@@ -8,17 +8,17 @@ import pytest
 import torch
 
 from bodies import ball, cuboid
-from nerif.fields.base import Field
+from nerif.fields.field import Field
 from nerif.fields.network import NetworkShape, NeuralField
 from nerif.fields.network_kinds import network_in
 from nerif.fields.walls import WallNetwork
 from nerif.geometry import Box, Grid, Ring
 from nerif.geometry.body import contained, from_surface
 from nerif.imaging.bodies import with_bodies
-from nerif.reconstruction.base import Outcome, Reconstruction
-from nerif.reconstruction.files import read_field, write_field
+from nerif.reconstruction.field_files import read_field, write_field
 from nerif.reconstruction.neural.fused import value_and_gradient
 from nerif.reconstruction.neural.presets import preset
+from nerif.reconstruction.reconstructor import Outcome, Reconstruction
 from nerif.simulation.simulate import simulate
 
 BOX = Box.cube(40.0)

@@ -9,7 +9,7 @@ from itertools import pairwise
 import pytest
 import torch
 
-from nerif.fields.base import Field
+from nerif.fields.field import Field
 from nerif.fields.phantoms import GaussianBalls
 from nerif.forward.deflection import MODELS
 from nerif.forward.path_integral import PathIntegral, project

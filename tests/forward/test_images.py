@@ -18,15 +18,15 @@ from nerif.analysis.prediction import predict, reproject
 from nerif.cli.cli import main
 from nerif.data.measurement import Measurement
 from nerif.data.volume import Volume
-from nerif.fields.grid import VoxelField
 from nerif.fields.network import NetworkShape
 from nerif.fields.phantoms import GaussianBalls
+from nerif.fields.voxel_field import VoxelField
 from nerif.forward.deflection import LeverArm
 from nerif.forward.images import Images, References
 from nerif.forward.interferometry import Interferometry
 from nerif.forward.registry import forward_model
 from nerif.geometry import Box, Grid, Ring
-from nerif.reconstruction.detail import Detail
+from nerif.reconstruction.detail.detail import Detail
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.neural.trainer import Trainer
 from nerif.reconstruction.neural.training_data import TrainingData

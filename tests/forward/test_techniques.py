@@ -16,31 +16,31 @@ from nerif.analysis.evaluation import evaluate_views
 from nerif.analysis.gains import fit_gains, with_gains
 from nerif.analysis.prediction import predict, reproject
 from nerif.data.measurement import Measurement, measurement_of
-from nerif.fields.base import Field
-from nerif.fields.grid import Boundary
+from nerif.fields.field import Field
 from nerif.fields.network import Network, NetworkShape, NeuralField
 from nerif.fields.phantoms import GaussianBalls, Scaled
+from nerif.fields.voxel_field import Boundary
 from nerif.forward import registry
 from nerif.forward.absorption import Absorption, absorbance
-from nerif.forward.base import ForwardModel, Light, Weights, midpoints
 from nerif.forward.deflection import Deflection
 from nerif.forward.emission import Emission
+from nerif.forward.forward_model import ForwardModel, Light, Weights, midpoints
 from nerif.forward.interferometry import Interferometry
 from nerif.forward.path_integral import PathIntegral
 from nerif.forward.registry import TECHNIQUES, forward_model, forward_models
 from nerif.geometry import Box, Grid, Lens, Rays, Ring
-from nerif.reconstruction.base import Reconstructor, State
-from nerif.reconstruction.files import read_state, write_state
+from nerif.reconstruction.field_files import read_state, write_state
 from nerif.reconstruction.neural.losses import LossWeights, loss_terms
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.neural.trainer import Trainer
 from nerif.reconstruction.neural.training_data import TrainingData
+from nerif.reconstruction.reconstructor import Reconstructor, State
 from nerif.reconstruction.target import Target
 from nerif.reconstruction.voxels.multiplicative import MART, MLEM
 from nerif.reconstruction.voxels.operator import VoxelOperator
-from nerif.reconstruction.voxels.problem import Problem
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.reconstruction.voxels.total_variation import TotalVariation
+from nerif.reconstruction.voxels.voxel_problem import Problem
 from nerif.simulation.simulate import Simulation, simulate
 from refusals import refused
 

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from nerif.geometry import TELECENTRIC, Camera, Lens, Plane, Ring
 from nerif.geometry.distortion import distort, from_sensor, tilt
-from nerif.reconstruction.files import _parts, digest
+from nerif.reconstruction.field_files import _parts, digest
 from nerif.simulation.simulate import simulate
 from refusals import refused
 

@@ -14,20 +14,20 @@ from nerif.analysis.consistency import binned
 from nerif.analysis.prediction import _interpolated, reproject
 from nerif.cli.cli import main
 from nerif.common.conventions import InputError
+from nerif.data.cameras_file import CalibratedCamera, read_cameras, write_cameras
 from nerif.data.measurement import Measurement, measurement_of
 from nerif.data.volume import Volume
-from nerif.fields.grid import Boundary
+from nerif.fields.voxel_field import Boundary
 from nerif.forward.absorption import Absorption
 from nerif.forward.deflection import LeverArm
 from nerif.forward.path_integral import PathIntegral
 from nerif.forward.ray_tracing import background_points
 from nerif.forward.registry import TECHNIQUES, forward_model
 from nerif.geometry import PROJECTIONS, TELECENTRIC, Camera, Grid, Rays, Ring
-from nerif.imaging.calibration.cameras_file import CalibratedCamera, read_cameras, write_cameras
 from nerif.physics.quantities import GasSettings, derive
-from nerif.reconstruction.files import _parts, digest
+from nerif.reconstruction.bins import binned_rays
+from nerif.reconstruction.field_files import _parts, digest
 from nerif.reconstruction.gauge import visual_hull
-from nerif.reconstruction.neural.bins import binned_rays
 from nerif.reconstruction.voxels.operator import VoxelOperator
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.report.rig_figure import draw_rig, image_corners

@@ -13,10 +13,10 @@ from scipy.spatial.transform import Rotation
 
 from calibration_images import detection, target_images
 from nerif.common.files import read_toml
+from nerif.data.cameras_file import read_cameras
 from nerif.geometry import PROJECTIONS, TELECENTRIC, Camera, Plane, Ring
 from nerif.imaging.calibration.bundle import INTRINSIC, Bundle, Observation, Pose, _Layout, adjust
 from nerif.imaging.calibration.calibrate import CalibrationSettings, _on_side, calibrate
-from nerif.imaging.calibration.cameras_file import read_cameras
 from nerif.imaging.calibration.first_guess import first_guess, mirror
 from nerif.imaging.calibration.result import Calibration
 from nerif.imaging.calibration.targets import CalibrationTarget, Detection, ViewImages

@@ -21,8 +21,8 @@ from scipy.spatial.transform import Rotation
 from nerif.cli.commands import calibrate
 from nerif.cli.commands.displacement import Displacement
 from nerif.common.conventions import InputError
+from nerif.data.cameras_file import CalibratedCamera, read_box, read_cameras, write_cameras
 from nerif.geometry import TELECENTRIC, Box, Camera, Lens, Plane
-from nerif.imaging.calibration.cameras_file import CalibratedCamera, read_box, read_cameras, write_cameras
 from nerif.imaging.calibration.importers.importers import ImportSettings, import_cameras, is_calibration
 from refusals import refused
 

@@ -13,14 +13,14 @@ from scipy.ndimage import gaussian_filter, map_coordinates, zoom
 from scipy.spatial.transform import Rotation
 
 from imaging_files import packed, write_cv, write_images, write_photron, write_tiff
+from nerif.data.cameras_file import CalibratedCamera
 from nerif.geometry import Camera, Plane, Ring
 from nerif.imaging.calibration.bundle import Pose
-from nerif.imaging.calibration.cameras_file import CalibratedCamera
 from nerif.imaging.calibration.simple_rig import find_image
 from nerif.imaging.calibration.target_images import find_targets
 from nerif.imaging.calibration.targets import CalibrationTarget
 from nerif.imaging.displacement.displacement import DisplacementSettings, Reference
-from nerif.imaging.image_quality import image_quality
+from nerif.imaging.quality.image_quality import image_quality
 from nerif.imaging.readers.binning import Binning
 from nerif.imaging.readers.crop import Crop
 from nerif.imaging.readers.exposure import saturated

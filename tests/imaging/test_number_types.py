@@ -18,11 +18,11 @@ from nerif.imaging.displacement.displacement import (
     measure,
     remove_shake,
 )
-from nerif.imaging.displacement.noise import local_correlation, smoothing_error, structure_variance
 from nerif.imaging.displacement.photometry import CameraNoise, ImagePair
 from nerif.imaging.displacement.warping import warp
-from nerif.imaging.image_quality import shrink
 from nerif.imaging.masks import MaskSettings, flow_mask
+from nerif.imaging.noise import local_correlation, smoothing_error, structure_variance
+from nerif.imaging.quality.image_quality import shrink
 from nerif.imaging.readers.exposure import check_exposure, saturated
 
 SHAPE = 32, 36

@@ -17,10 +17,10 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 
 from imaging_files import write_cine
 from nerif.common.conventions import InputError
+from nerif.data.cameras_file import CalibratedCamera
 from nerif.data.measurement import Measurement
 from nerif.geometry import Box, Lens, Plane, Ring
 from nerif.imaging import workers
-from nerif.imaging.calibration.cameras_file import CalibratedCamera
 from nerif.imaging.displacement.displacement import DisplacementSettings
 from nerif.imaging.masks import MaskSettings
 from nerif.imaging.readers.crop import Crop

@@ -10,10 +10,10 @@ import tifffile
 from scipy.ndimage import gaussian_filter
 from scipy.ndimage import shift as moved
 
-from nerif.imaging.image_quality import image_quality
+from nerif.imaging.quality.image_quality import image_quality
+from nerif.imaging.quality.reference_outliers import outliers, without_outliers
+from nerif.imaging.quality.thumbnails import Thumbnail, match
 from nerif.imaging.readers.views import View, good_images
-from nerif.imaging.reference_outliers import outliers, without_outliers
-from nerif.imaging.thumbnails import Thumbnail, match
 
 SHAPE = (100, 130)
 ROWS, COLUMNS = np.mgrid[: SHAPE[0], : SHAPE[1]]

@@ -9,8 +9,8 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from nerif.imaging.displacement.displacement import DisplacementSettings, measure
-from nerif.imaging.displacement.repetition import repetition
 from nerif.imaging.patterns import KINDS, Background
+from nerif.imaging.quality.repetition import repetition
 
 SHAPE = (220, 260)
 

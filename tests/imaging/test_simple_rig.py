@@ -12,9 +12,9 @@ import torch
 
 from imaging_files import write_images
 from nerif.common.conventions import InputError
+from nerif.data.cameras_file import read_box, read_cameras, write_cameras
 from nerif.data.measurement import Measurement
 from nerif.geometry import Box, Lens
-from nerif.imaging.calibration.cameras_file import read_box, read_cameras, write_cameras
 from nerif.imaging.calibration.importers.importers import ImportSettings, import_box
 from nerif.imaging.calibration.simple_rig import SimpleRig, box_about_axis, find_image, simple_camera
 from refusals import refused

@@ -14,7 +14,7 @@ import tifffile
 from nerif.common.conventions import InputError
 from nerif.imaging.calibration.target_images import find_targets, pose_names
 from nerif.imaging.calibration.targets import CalibrationTarget
-from nerif.imaging.image_quality import image_quality, jpeg_address, shrink
+from nerif.imaging.quality.image_quality import image_quality, jpeg_address, shrink
 from nerif.imaging.readers.crop import Crop
 from nerif.imaging.readers.image_files import Tiff
 from nerif.imaging.readers.open import open_frames

@@ -20,10 +20,10 @@ from nerif.cli.cli import main
 from nerif.common.conventions import percent, with_unit
 from nerif.data.measurement import Measurement
 from nerif.data.volume import Volume
-from nerif.fields.base import Field
+from nerif.fields.field import Field
 from nerif.geometry import Box, Grid
 from nerif.plotting.notebook import VIEWS, number, panel, show_views
-from nerif.reconstruction.base import Outcome
+from nerif.reconstruction.reconstructor import Outcome
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 
 

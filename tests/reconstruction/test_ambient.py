@@ -13,9 +13,9 @@ from nerif.cli.cli import main
 from nerif.common.conventions import InputError
 from nerif.data.volume import Volume
 from nerif.data.volume_file import write_netcdf
-from nerif.fields.grid import VoxelField
+from nerif.fields.voxel_field import VoxelField
 from nerif.geometry import Grid
-from nerif.reconstruction.base import Outcome, Reconstruction
+from nerif.reconstruction.reconstructor import Outcome, Reconstruction
 from nerif.results.directory import ResultDirectory
 from nerif.simulation.simulate import Simulation, simulate
 
@@ -79,7 +79,7 @@ def test_frames_are_compared_with_truths_over_another_ambient(measurement, tmp_p
     from nerif.data.measurement_sequence import MeasurementSequence
     from nerif.data.volume_sequence import VolumeSequence
     from nerif.fields.network import Network, NetworkShape, NeuralField
-    from nerif.workflow.sequence.evaluation import evaluate_sequence
+    from nerif.workflow.sequence.sequence_evaluation import evaluate_sequence
     from nerif.workflow.sequence.store import Frame, SequenceStore
 
     shape, grid = NetworkShape(2, 8, 1), Grid(measurement.box, (6, 7, 8))

@@ -12,7 +12,7 @@ from nerif.forward.deflection import MODELS, Deflection
 from nerif.forward.interferometry import Interferometry
 from nerif.forward.path_integral import PathIntegral, project
 from nerif.geometry import Ring, paper_rig
-from nerif.reconstruction.neural.bins import binned_rays, coarsest_edge, pixel_subset, withhold_pixels
+from nerif.reconstruction.bins import binned_rays, coarsest_edge, pixel_subset, withhold_pixels
 from nerif.reconstruction.target import Target
 from nerif.simulation.simulate import simulate
 

@@ -10,13 +10,12 @@ import torch
 
 from nerif.analysis.prediction import reproject
 from nerif.data.volume import Volume
-from nerif.fields.grid import VoxelField
+from nerif.fields.voxel_field import VoxelField
 from nerif.geometry import Box, Grid, Ring
 from nerif.physics.quantities import GasSettings
-from nerif.reconstruction.base import Outcome, Reconstruction
 from nerif.reconstruction.neural.neural import NeRIF
-from nerif.reconstruction.rig.posterior import RigPosterior
-from nerif.reconstruction.rig.refinement import Refinement
+from nerif.reconstruction.reconstructor import Outcome, Reconstruction
+from nerif.reconstruction.rig_refinement import Refinement
 from nerif.reconstruction.uncertainty.bootstrap import (
     BLOCK,
     LOST,
@@ -27,6 +26,7 @@ from nerif.reconstruction.uncertainty.bootstrap import (
     best_covered,
 )  # fmt: skip
 from nerif.reconstruction.uncertainty.deviations import VOXELS, WIDTH
+from nerif.reconstruction.uncertainty.rig_posterior import RigPosterior
 from refusals import refused
 
 AMBIENT = 1.00027

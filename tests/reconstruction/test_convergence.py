@@ -13,11 +13,11 @@ from nerif.analysis.evaluation import evaluate_volume
 from nerif.data.volume import Volume
 from nerif.fields.network import NetworkShape
 from nerif.geometry import Grid
-from nerif.reconstruction.base import Step
-from nerif.reconstruction.files import read_state, write_state
+from nerif.reconstruction.field_files import read_state, write_state
 from nerif.reconstruction.neural import objective, schedule
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.neural.training_data import TrainingData
+from nerif.reconstruction.reconstructor import Step
 from nerif.simulation.simulate import add_noise
 from refusals import refused
 
@@ -86,7 +86,7 @@ def test_the_result_is_that_of_the_best_cycle(measurement, monkeypatch, first, r
     """Here of the first cycle."""
     errors, states = itertools.chain([2.0], itertools.repeat(3.0)), []
     monkeypatch.setattr(objective.Objective, "withheld_residual", lambda self, density: next(errors))
-    monkeypatch.setattr("nerif.reconstruction.rig.refinement.SIGN", -1.0)  # the rig counts as off
+    monkeypatch.setattr("nerif.reconstruction.rig_refinement.SIGN", -1.0)  # the rig counts as off
     settings = replace(ENDLESS, first_cycle=first, refine=refine)
 
     def on_step(step: Step) -> bool:

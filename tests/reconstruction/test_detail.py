@@ -10,18 +10,18 @@ import torch
 from scipy.ndimage import gaussian_filter
 
 from nerif.data.measurement import Measurement
-from nerif.fields.grid import VoxelField
 from nerif.fields.phantoms import make_phantom
 from nerif.fields.sum import SumField
 from nerif.fields.symmetric import SymmetricVoxels
 from nerif.fields.turbulence import TurbulentPlume
+from nerif.fields.voxel_field import VoxelField
 from nerif.forward.absorption import Absorption
 from nerif.geometry import Box, Grid, Ring, paper_rig
-from nerif.reconstruction.detail import COARSE, SIGNIFICANT, Choice, Detail, choose, voxels_of
+from nerif.reconstruction.detail.detail import COARSE, SIGNIFICANT, Choice, Detail, choose, voxels_of
+from nerif.reconstruction.detail.gaussian_process import GaussianProcess
 from nerif.reconstruction.gauge import visual_hull
-from nerif.reconstruction.gaussian_process import GaussianProcess
 from nerif.reconstruction.neural.neural import NeRIF
-from nerif.reconstruction.symmetry import axis_of
+from nerif.reconstruction.voxels.symmetry_axis import axis_of
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.reconstruction.voxels.total_variation import TotalVariation
 from nerif.simulation.simulate import simulate

@@ -14,9 +14,9 @@ from nerif.analysis.consistency import check_consistency
 from nerif.analysis.prediction import predict, reproject
 from nerif.analysis.rig_check import check_rig
 from nerif.common.pauses import at_pauses, pause
-from nerif.fields.grid import VoxelField
 from nerif.fields.network import Network, NetworkShape
 from nerif.fields.phantoms import make_phantom
+from nerif.fields.voxel_field import VoxelField
 from nerif.geometry import Box, Grid, Ring
 from nerif.reconstruction import device as threads
 from nerif.reconstruction.device import (

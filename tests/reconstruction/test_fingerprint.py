@@ -11,9 +11,9 @@ from nerif.data.measurement import Measurement
 from nerif.fields.network import NetworkShape
 from nerif.forward.registry import technique
 from nerif.geometry import Box
-from nerif.reconstruction.base import Reconstructor, State
-from nerif.reconstruction.files import fingerprint
+from nerif.reconstruction.field_files import fingerprint
 from nerif.reconstruction.neural.neural import NeRIF
+from nerif.reconstruction.reconstructor import Reconstructor, State
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.simulation.simulate import simulate
 from refusals import refused

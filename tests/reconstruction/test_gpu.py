@@ -15,7 +15,7 @@ from nerif.fields.network import NetworkShape
 from nerif.forward.deflection import LeverArm
 from nerif.forward.path_integral import PathIntegral, project
 from nerif.geometry import Lens
-from nerif.reconstruction.detail import Detail
+from nerif.reconstruction.detail.detail import Detail
 from nerif.reconstruction.neural.presets import PRESETS
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.reconstruction.voxels.total_variation import TotalVariation

@@ -13,12 +13,12 @@ from scipy.ndimage import gaussian_filter
 from nerif.data.measurement import Measurement
 from nerif.fields.phantoms import GaussianBalls, make_phantom
 from nerif.geometry import Box, Grid, Ring, paper_rig
-from nerif.reconstruction.neural.bins import binned_rays
+from nerif.reconstruction.bins import binned_rays
 from nerif.reconstruction.voxels.landweber import Landweber
 from nerif.reconstruction.voxels.layout import InSpace
 from nerif.reconstruction.voxels.levels import Level, levels, pixels_in_a_voxel
-from nerif.reconstruction.voxels.problem import Iterate
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
+from nerif.reconstruction.voxels.voxel_problem import Iterate
 from nerif.reconstruction.voxels.weight import DISCREPANCY, HIGHEST, LOWEST, choose_weight, sharpest_corner
 from nerif.simulation.simulate import simulate
 

@@ -16,16 +16,17 @@ from nerif.data.measurement import Measurement
 from nerif.data.volume import Volume
 from nerif.fields.network import Network, NetworkShape
 from nerif.fields.phantoms import make_phantom
-from nerif.forward.base import Weights
+from nerif.forward.forward_model import Weights
 from nerif.geometry import Grid, paper_rig
-from nerif.reconstruction.base import Reconstruction, Step
-from nerif.reconstruction.files import read_state, write_state
+from nerif.reconstruction import bins
+from nerif.reconstruction.field_files import read_state, write_state
 from nerif.reconstruction.gauge import Gauge
-from nerif.reconstruction.neural import bins, callbacks, objective, trainer
+from nerif.reconstruction.neural import callbacks, objective, trainer
 from nerif.reconstruction.neural.losses import LossWeights, MixedPrecision, by_differences
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.neural.presets import PRESETS, preset
 from nerif.reconstruction.neural.training_data import TrainingData
+from nerif.reconstruction.reconstructor import Reconstruction, Step
 from nerif.reconstruction.target import Target
 from nerif.simulation.simulate import simulate
 from refusals import refused

@@ -12,7 +12,7 @@ from itertools import pairwise
 import pytest
 import torch
 
-from nerif.fields.grid import Boundary
+from nerif.fields.voxel_field import Boundary
 from nerif.forward.deflection import MODELS
 from nerif.geometry import BackgroundPoints, Box, Camera, Grid, Plane, Rays, Ring
 from nerif.reconstruction.voxels.operator import VoxelOperator, operator_norm

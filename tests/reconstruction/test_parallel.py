@@ -14,7 +14,7 @@ import torch
 from nerif.cli.cli import main
 from nerif.data.measurement import Measurement
 from nerif.fields.network import NetworkShape
-from nerif.reconstruction.files import read_field
+from nerif.reconstruction.field_files import read_field
 from nerif.reconstruction.neural.losses import LossWeights, MixedPrecision
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.neural.objective import Objective

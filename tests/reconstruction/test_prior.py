@@ -9,10 +9,10 @@ import pytest
 import torch
 
 from nerif.geometry import Box, Grid
+from nerif.reconstruction.detail.detail_prior import Prior, WhiteProblem, von_karman
 from nerif.reconstruction.target import Target
 from nerif.reconstruction.voxels.layout import layout_of
-from nerif.reconstruction.voxels.prior import Prior, WhiteProblem, von_karman
-from nerif.reconstruction.voxels.problem import Problem
+from nerif.reconstruction.voxels.voxel_problem import Problem
 
 SHAPE = (5, 6, 7)  # z, y, x
 ITERATIONS = 40

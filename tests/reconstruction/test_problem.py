@@ -11,13 +11,15 @@ import pytest
 import scipy.optimize
 import torch
 
-from nerif.fields.grid import Boundary
+from nerif.fields.voxel_field import Boundary
 from nerif.geometry import Box, Grid
 from nerif.reconstruction.target import Target
-from nerif.reconstruction.voxels import problem as problem_module
+from nerif.reconstruction.voxels import voxel_problem as problem_module
 from nerif.reconstruction.voxels.landweber import Landweber
 from nerif.reconstruction.voxels.operator import VoxelOperator
-from nerif.reconstruction.voxels.problem import (
+from nerif.reconstruction.voxels.tikhonov import Tikhonov
+from nerif.reconstruction.voxels.total_variation import TotalVariation, at_faces, gradient_square
+from nerif.reconstruction.voxels.voxel_problem import (
     Differences,
     Penalty,
     Problem,
@@ -26,8 +28,6 @@ from nerif.reconstruction.voxels.problem import (
     response,
     spectrum_of_differences,
 )  # fmt: skip
-from nerif.reconstruction.voxels.tikhonov import Tikhonov
-from nerif.reconstruction.voxels.total_variation import TotalVariation, at_faces, gradient_square
 
 SHAPE = (4, 5, 6)
 WEIGHTS = {"gradient": 1e-3, "identity": 1e-2, "laplacian": 1e-6}

@@ -11,8 +11,8 @@ import torch
 import nerif
 from nerif.common.conventions import FACES
 from nerif.data.measurement import Measurement
-from nerif.fields.grid import DEGREES
-from nerif.forward.base import ForwardModel
+from nerif.fields.voxel_field import DEGREES
+from nerif.forward.forward_model import ForwardModel
 from nerif.forward.path_integral import PathIntegral, project
 from nerif.forward.registry import TECHNIQUES, forward_model
 from nerif.geometry import Box, Grid, Ring

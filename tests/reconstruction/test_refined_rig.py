@@ -15,14 +15,14 @@ from matplotlib.figure import Figure
 from nerif.analysis.rig_check import check_rig
 from nerif.cli.cli import main
 from nerif.data.measurement import Measurement
-from nerif.fields.base import Field
+from nerif.fields.field import Field
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Ring
 from nerif.geometry.pose import GEOMETRY, Corrections
 from nerif.reconstruction.progress import Monitor
-from nerif.reconstruction.rig.parameters import NAMES, UNCONSTRAINED, refinement_lines, with_corrections
-from nerif.reconstruction.rig.posterior import RigPosterior
-from nerif.reconstruction.rig.refinement import Refinement, refit
+from nerif.reconstruction.rig_parameters import NAMES, UNCONSTRAINED, refinement_lines, with_corrections
+from nerif.reconstruction.rig_refinement import Refinement, refit
+from nerif.reconstruction.uncertainty.rig_posterior import RigPosterior
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.reconstruction.voxels.total_variation import TotalVariation
 from nerif.report.figures import draw_corrections
@@ -57,7 +57,7 @@ def simulated(field: Field, ring: Ring = RING) -> Measurement:
 @pytest.fixture(autouse=True)
 def _coarse(monkeypatch):
     """The posterior hardly depends on the grid; its time does."""
-    monkeypatch.setattr("nerif.reconstruction.rig.posterior.VOXELS", 8)
+    monkeypatch.setattr("nerif.reconstruction.uncertainty.rig_posterior.VOXELS", 8)
 
 
 @pytest.fixture(scope="module")
@@ -217,7 +217,7 @@ def test_a_result_has_the_posterior_and_the_withheld_view_with_both_cameras(meas
 
 
 def test_trials_refine_rigs_of_their_own_which_are_read_again(measured, tmp_path, monkeypatch):
-    monkeypatch.setattr("nerif.reconstruction.rig.posterior.VOXELS", 4)
+    monkeypatch.setattr("nerif.reconstruction.uncertainty.rig_posterior.VOXELS", 4)
     monkeypatch.setattr("nerif.reconstruction.voxels.descent.ROUNDS", 2)
     monkeypatch.setattr("nerif.reconstruction.uncertainty.bootstrap.VOXELS", 12)
     out, lines = ResultDirectory(tmp_path / "r"), []

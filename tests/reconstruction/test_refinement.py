@@ -11,6 +11,7 @@ import torch
 
 from nerif.analysis.alignment import MovedField, aligned
 from nerif.cli.cli import main
+from nerif.data.cameras_file import read_cameras
 from nerif.data.measurement import Measurement
 from nerif.data.volume import Volume
 from nerif.data.volume_file import write_netcdf
@@ -19,11 +20,10 @@ from nerif.forward.absorption import Absorption
 from nerif.forward.path_integral import PathIntegral, project
 from nerif.geometry import Box, Grid, Lens, Ring
 from nerif.geometry.pose import GEOMETRY, Corrections
-from nerif.imaging.calibration.cameras_file import read_cameras
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.neural.training_data import TrainingData
-from nerif.reconstruction.rig.parameters import NAMES, displaced, refinement_lines, with_corrections
-from nerif.reconstruction.rig.refinement import Refinement
+from nerif.reconstruction.rig_parameters import NAMES, displaced, refinement_lines, with_corrections
+from nerif.reconstruction.rig_refinement import Refinement
 from nerif.reconstruction.target import Target
 from nerif.simulation.simulate import simulate
 from refusals import refused
@@ -288,7 +288,7 @@ def test_significant_corrections_are_reported():
 
 @pytest.mark.slow
 def test_the_command_line_refines_writes_and_evaluates(wrong, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("nerif.reconstruction.rig.posterior.VOXELS", 6)
+    monkeypatch.setattr("nerif.reconstruction.uncertainty.rig_posterior.VOXELS", 6)
     grid = Grid.of_resolution(BOX, 24)
     write_netcdf(tmp_path / "truth.nc", [Volume.of(BALLS.sample(grid), grid, "index_excess", 1.00027)])
     wrong.write(tmp_path / "m.nc")

@@ -10,7 +10,6 @@ import pytest
 import torch
 
 from nerif.fields.network import NetworkShape
-from nerif.reconstruction.base import Step
 from nerif.reconstruction.neural import schedule as module
 from nerif.reconstruction.neural import trainer
 from nerif.reconstruction.neural.callbacks import EMPTY_RATE, EMPTY_STEPS, MIN_STEPS, FitMonitor
@@ -19,6 +18,7 @@ from nerif.reconstruction.neural.parallel import Ranks
 from nerif.reconstruction.neural.presets import preset
 from nerif.reconstruction.neural.schedule import PACE_STEPS, Cycles, Pace, Schedule, duration
 from nerif.reconstruction.progress import Monitor
+from nerif.reconstruction.reconstructor import Step
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.results.live import read_live
 from nerif.workflow.job import Run

@@ -11,16 +11,21 @@ import pytest
 import torch
 
 from nerif.common.arrays import Points
-from nerif.fields.base import Field
+from nerif.fields.field import Field
 from nerif.fields.phantoms import make_phantom
-from nerif.forward.base import midpoints
 from nerif.forward.emission import Emission
+from nerif.forward.forward_model import midpoints
 from nerif.forward.path_integral import PathIntegral
 from nerif.forward.registry import forward_models
 from nerif.geometry import Box, Grid, Lens, Ring, paper_rig
 from nerif.geometry.symmetry import Symmetry
 from nerif.reconstruction.neural.neural import NeRIF
-from nerif.reconstruction.symmetry import (
+from nerif.reconstruction.voxels.landweber import Landweber
+from nerif.reconstruction.voxels.layout import Symmetric
+from nerif.reconstruction.voxels.multiplicative import MLEM
+from nerif.reconstruction.voxels.operator import rays_through
+from nerif.reconstruction.voxels.symmetric_operator import SymmetricOperator
+from nerif.reconstruction.voxels.symmetry_axis import (
     axis_of,
     better_direction,
     check_views,
@@ -28,11 +33,6 @@ from nerif.reconstruction.symmetry import (
     symmetry_of,
     too_few_views,
 )  # fmt: skip
-from nerif.reconstruction.voxels.landweber import Landweber
-from nerif.reconstruction.voxels.layout import Symmetric
-from nerif.reconstruction.voxels.multiplicative import MLEM
-from nerif.reconstruction.voxels.operator import rays_through
-from nerif.reconstruction.voxels.symmetric_operator import SymmetricOperator
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.reconstruction.voxels.total_variation import TotalVariation
 from nerif.simulation.simulate import simulate

@@ -11,18 +11,18 @@ from safetensors import SafetensorError
 
 from nerif.analysis.evaluation import evaluate_views, evaluate_volume, reproject
 from nerif.data.volume import Volume
-from nerif.fields.grid import VoxelField
+from nerif.fields.voxel_field import VoxelField
 from nerif.geometry import Grid, Lens
-from nerif.reconstruction.base import Reconstruction, State, Step
-from nerif.reconstruction.files import CHECKPOINT, read_field, read_state, write_field, write_state
+from nerif.reconstruction.field_files import CHECKPOINT, read_field, read_state, write_field, write_state
 from nerif.reconstruction.gauge import visual_hull
+from nerif.reconstruction.reconstructor import Reconstruction, State, Step
 from nerif.reconstruction.voxels import descent, kernels_numba, kernels_torch
 from nerif.reconstruction.voxels.landweber import Landweber
 from nerif.reconstruction.voxels.operator import VoxelOperator
-from nerif.reconstruction.voxels.problem import Iterate
-from nerif.reconstruction.voxels.settings import COMPILER_BYTES
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.reconstruction.voxels.total_variation import TotalVariation
+from nerif.reconstruction.voxels.voxel_problem import Iterate
+from nerif.reconstruction.voxels.voxel_reconstructor import COMPILER_BYTES
 from refusals import refused
 
 LEAST_CC = {Tikhonov: 0.94, Landweber: 0.86, TotalVariation: 0.98}  # five views are few

@@ -11,10 +11,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from nerif.fields.base import Field
-from nerif.fields.grid import VoxelField
+from nerif.fields.field import Field
 from nerif.fields.network import Network, NetworkShape, NeuralField
 from nerif.fields.symmetric import SymmetricNetwork
+from nerif.fields.voxel_field import VoxelField
 from nerif.forward.deflection import MODELS
 from nerif.forward.path_integral import PathIntegral, project
 from nerif.geometry import Box, Grid

@@ -14,8 +14,8 @@ from nerif.cli.cli import main
 from nerif.data.volume import Volume
 from nerif.geometry import Box, Grid
 from nerif.report import html
+from nerif.report.journal_figures import error_of
 from nerif.report.packing import relation
-from nerif.report.pages import error_of
 from nerif.results.directory import Result, ResultDirectory
 from report import browsing
 from report.browsing import changed, choose, drag, errors, image, press, show, slide, swipe, text, wait_for

@@ -18,12 +18,12 @@ from nerif.geometry.symmetry import Axis, Symmetry
 from nerif.physics.quantities import GasSettings, derive
 from nerif.plotting.notebook import number
 from nerif.report import html, packing
-from nerif.report.pages import residuals_over_sigma
+from nerif.report.journal_figures import residuals_over_sigma
 from nerif.report.scene import scene_of
 from nerif.report.summary import LEVELS, Statement, statements
 from nerif.report.view_images import _shrink, lattice_step, view_images
 from nerif.results.directory import Result, ResultDirectory
-from nerif.results.metrics import Metrics
+from nerif.results.metrics_file import Metrics
 from refusals import refused
 from report.page_reading import quantity_of, unpack
 

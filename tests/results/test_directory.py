@@ -10,7 +10,7 @@ import pytest
 from nerif.app.project import Project
 from nerif.cli.cli import main
 from nerif.results.directory import ResultDirectory
-from nerif.results.metrics import Metrics
+from nerif.results.metrics_file import Metrics
 from refusals import refused
 
 

@@ -11,9 +11,9 @@ import torch
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Ring
 from nerif.geometry.pose import GEOMETRY, Corrections
-from nerif.reconstruction.base import Step
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.progress import QUIET
+from nerif.reconstruction.reconstructor import Step
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.results import live
 from nerif.results.live import Live, read_live, read_look

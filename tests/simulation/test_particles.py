@@ -10,8 +10,8 @@ import torch
 from nerif.geometry import Box, Grid
 from nerif.reconstruction.voxels.multiplicative import MART, MLEM
 from nerif.simulation.particles.cloud import Particles, quality_factor, spread
-from nerif.simulation.particles.images import image, images
-from nerif.simulation.particles.rig import four_cameras
+from nerif.simulation.particles.particle_images import image, images
+from nerif.simulation.particles.particle_rig import four_cameras
 from refusals import refused
 
 BOX = Box((-1.0, -2.0, -1.5), (1.0, 2.0, 1.5))

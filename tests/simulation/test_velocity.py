@@ -11,8 +11,8 @@ import nerif
 from nerif.data.volume import Volume
 from nerif.geometry import Box, Grid
 from nerif.simulation.particles.cloud import Particles
+from nerif.simulation.particles.particle_velocity import velocity_between, write_velocities
 from nerif.simulation.particles.ring import VortexRing
-from nerif.simulation.particles.velocity import velocity_between, write_velocities
 from refusals import refused
 
 RING = VortexRing(radius=4.0, core=1.2, circulation=300.0, centre=(0.5, -1.0, 2.0))

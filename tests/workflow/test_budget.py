@@ -12,7 +12,7 @@ from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.progress import Monitor
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.results.directory import ResultDirectory
-from nerif.results.metrics import Metrics
+from nerif.results.metrics_file import Metrics
 from nerif.workflow import budget
 from nerif.workflow.budget import LEAST, NO_LIMIT, Budget
 from nerif.workflow.job import Job, Run

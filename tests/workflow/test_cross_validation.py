@@ -13,13 +13,13 @@ import torch
 from nerif.analysis.evaluation import evaluate_views
 from nerif.analysis.prediction import reproject
 from nerif.cli.cli import main
-from nerif.fields.grid import VoxelField
 from nerif.fields.network import NetworkShape
+from nerif.fields.voxel_field import VoxelField
 from nerif.geometry import Grid
 from nerif.geometry.pose import GEOMETRY, Corrections
-from nerif.reconstruction.base import Outcome, Reconstruction, Step
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.progress import Monitor
+from nerif.reconstruction.reconstructor import Outcome, Reconstruction, Step
 from nerif.reconstruction.uncertainty.bootstrap import best_covered
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.report.summary import accuracy_rows, statements

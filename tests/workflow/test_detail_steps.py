@@ -11,7 +11,7 @@ from nerif.cli.cli import main
 from nerif.fields.sum import SumField
 from nerif.fields.turbulence import TurbulentPlume
 from nerif.geometry import Box, Ring
-from nerif.reconstruction.detail import Choice
+from nerif.reconstruction.detail.detail import Choice
 from nerif.reconstruction.progress import Monitor
 from nerif.reconstruction.voxels.total_variation import TotalVariation
 from nerif.results.directory import ResultDirectory

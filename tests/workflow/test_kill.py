@@ -16,8 +16,8 @@ import torch
 from nerif.data.measurement import Measurement
 from nerif.fields.network import NetworkShape
 from nerif.geometry import Grid
-from nerif.reconstruction.base import Reconstructor
 from nerif.reconstruction.neural.neural import NeRIF
+from nerif.reconstruction.reconstructor import Reconstructor
 from nerif.reconstruction.voxels.total_variation import TotalVariation
 from nerif.results.directory import ResultDirectory
 from nerif.workflow.job import Run

@@ -20,8 +20,8 @@ from nerif.cli.cli import main
 from nerif.common.files import atomic
 from nerif.common.written_files import WRITTEN
 from nerif.data.measurement import Measurement
-from nerif.reconstruction.base import Reconstruction
 from nerif.reconstruction.progress import Monitor
+from nerif.reconstruction.reconstructor import Reconstruction
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.report.rig_figure import image_corners
 from nerif.results.directory import CALIBRATION, FILES, MERIDIAN, REPORT, ResultDirectory

@@ -17,11 +17,11 @@ from nerif.data.velocity_sequence import VelocitySequence
 from nerif.data.volume import Volume
 from nerif.data.volume_sequence import VolumeSequence
 from nerif.data.vti import read_vti
+from nerif.flow.assimilation import Iterate, VelocityFit
 from nerif.geometry import Box, Grid
 from nerif.geometry.symmetry import Symmetry
-from nerif.reconstruction.velocity.assimilation import Iterate, VelocityFit
 from nerif.report import velocity_page
-from nerif.workflow.velocity import densities, velocity_of_film
+from nerif.workflow.film_velocity import densities, velocity_of_film
 from refusals import refused
 
 pytest.importorskip("zarr", reason="velocities are stored by zarr (the extra `sequence`)")
@@ -145,7 +145,7 @@ def test_vorticity_of_a_rigid_rotation_is_twice_its_rate(tmp_path: Path):
 
 
 def test_an_interrupted_run_continues_from_its_checkpoint(film: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("nerif.workflow.velocity.CHECKPOINT_INTERVAL", 0.0)
+    monkeypatch.setattr("nerif.workflow.film_velocity.CHECKPOINT_INTERVAL", 0.0)
     settings, out = VelocityFit(resolution=12, max_iterations=12, time_limit=0, samples=0), tmp_path / "v.zarr"
 
     def stop(iterate: Iterate) -> None:
@@ -173,7 +173,7 @@ def test_an_interrupted_run_continues_from_its_checkpoint(film: Path, tmp_path: 
 
 
 def test_a_symmetric_film_is_solved_in_the_plane_of_its_axis(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("nerif.workflow.velocity.CHECKPOINT_INTERVAL", 0.0)
+    monkeypatch.setattr("nerif.workflow.film_velocity.CHECKPOINT_INTERVAL", 0.0)
     lean = math.radians(5.0)
     symmetry = Symmetry.about("axis", (1.0, -1.0, 0.0), (math.sin(lean), 0.0, math.cos(lean)), 1e-3)
     assert symmetry is not None

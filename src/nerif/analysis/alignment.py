@@ -8,7 +8,7 @@ from torch import Tensor
 
 from nerif.common.arrays import Points, Values, Vectors
 from nerif.data.volume import Volume
-from nerif.fields.base import Field, in_chunks
+from nerif.fields.field import Field, in_chunks
 from nerif.geometry.pose import rotation_matrix
 
 __all__ = ["MovedField", "aligned"]

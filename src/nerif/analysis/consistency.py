@@ -32,8 +32,8 @@ from nerif.common.conventions import FACES, InputError
 from nerif.common.findings import Finding
 from nerif.data.measurement import Measurement, Observation, integrals_of, measurement_of
 from nerif.data.volume import INDEX
-from nerif.fields.base import Field
-from nerif.forward.base import ForwardModel
+from nerif.fields.field import Field
+from nerif.forward.forward_model import ForwardModel
 from nerif.forward.path_integral import PathIntegral
 from nerif.forward.registry import forward_model
 from nerif.geometry import Camera, Grid

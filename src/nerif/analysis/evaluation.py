@@ -26,17 +26,17 @@ from nerif.data.measurement import Measurement, Observation
 from nerif.data.reprojection import Reprojection
 from nerif.data.volume import INDEX, Volume
 from nerif.data.volume_file import read_volume
-from nerif.fields.base import Field
-from nerif.fields.grid import VoxelField
-from nerif.forward.base import masked_blur
+from nerif.fields.field import Field
+from nerif.fields.voxel_field import VoxelField
+from nerif.forward.forward_model import masked_blur
 from nerif.forward.registry import AUTO, forward_model
 from nerif.geometry import Box
 from nerif.geometry.body import contained
 from nerif.plotting.notebook import number
 from nerif.reconstruction.aperture import apply_aperture
-from nerif.reconstruction.rig.parameters import with_corrections
+from nerif.reconstruction.rig_parameters import with_corrections
 from nerif.results.directory import METRICS, VOLUME, ResultDirectory
-from nerif.results.metrics import Metrics, ViewScores
+from nerif.results.metrics_file import Metrics, ViewScores
 
 FLOW = 0.02  # share of the largest excess, above which a voxel counts as flow
 ALIGNMENTS = ("none", "rigid")

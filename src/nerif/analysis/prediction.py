@@ -15,13 +15,13 @@ from nerif.common.pauses import pause
 from nerif.data.measurement import Measurement, measurement_of
 from nerif.data.reprojection import Accuracy, Reprojection
 from nerif.data.volume import name_of
-from nerif.fields.base import Field
-from nerif.fields.grid import VoxelField
+from nerif.fields.field import Field
 from nerif.fields.network import Network, NeuralField
 from nerif.fields.sum import SumField
 from nerif.fields.symmetric import SymmetricVoxels, symmetry_of_field
+from nerif.fields.voxel_field import VoxelField
 from nerif.fields.walls import WallNetwork
-from nerif.forward.base import ForwardModel
+from nerif.forward.forward_model import ForwardModel
 from nerif.forward.path_integral import LENS_RAYS, FieldProjector, PathIntegral, project
 from nerif.forward.ray_tracing import CurvedRays
 from nerif.forward.registry import ASSUMED, AUTO, TECHNIQUES, check_simulated, forward_model, forward_models

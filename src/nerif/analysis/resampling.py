@@ -8,7 +8,7 @@ import torch
 
 from nerif.common.conventions import InputError
 from nerif.data.volume import Volume
-from nerif.fields.grid import Boundary, VoxelField
+from nerif.fields.voxel_field import Boundary, VoxelField
 from nerif.geometry import Box, Grid
 
 __all__ = ["common_grid", "difference", "resampled"]

@@ -12,10 +12,10 @@ from nerif.reconstruction.aperture import apply_aperture
 from nerif.reconstruction.device import on_free_cores
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.progress import QUIET, Monitor
-from nerif.reconstruction.rig.parameters import MOVED, RefinedView, refinement_lines
-from nerif.reconstruction.rig.posterior import RigPosterior
+from nerif.reconstruction.rig_parameters import MOVED, RefinedView, refinement_lines
 from nerif.reconstruction.shared_settings import Aperture
 from nerif.reconstruction.sources import of_source
+from nerif.reconstruction.uncertainty.rig_posterior import RigPosterior
 
 __all__ = ["RigCheck", "check_rig"]
 

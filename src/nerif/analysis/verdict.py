@@ -35,7 +35,7 @@ from nerif.common.conventions import percent
 from nerif.data.volume import field_of
 from nerif.forward.registry import TECHNIQUES
 from nerif.results.directory import Result
-from nerif.results.metrics import HalfAsymmetry, ResidualTest, ViewScores
+from nerif.results.metrics_file import HalfAsymmetry, ResidualTest, ViewScores
 
 __all__ = ["RATINGS", "Estimate", "Verdict", "correlated_share", "cut_off", "time_of_fit", "verdict"]
 

@@ -13,7 +13,7 @@ from nerif.app.project import Project
 from nerif.common.conventions import InputError
 from nerif.imaging.calibration.target_images import explain_missing
 from nerif.imaging.calibration.targets import CalibrationTarget, Detection
-from nerif.imaging.image_quality import ImageQuality, image_quality, jpeg_address
+from nerif.imaging.quality.image_quality import ImageQuality, image_quality, jpeg_address
 from nerif.imaging.readers.crop import Crop
 from nerif.imaging.readers.views import View
 

@@ -14,12 +14,12 @@ from nerif.analysis.verdict import verdict
 from nerif.app.project import Contents, Project
 from nerif.common.conventions import InputError
 from nerif.data.velocity_sequence import VelocitySequence, open_volumes
-from nerif.reconstruction.base import END
-from nerif.reconstruction.files import FIELD
+from nerif.reconstruction.field_files import FIELD
+from nerif.reconstruction.reconstructor import END
 from nerif.report.movie import finished_frames
 from nerif.report.summary import accuracy_rows
 from nerif.results.directory import LIVE, METRICS, RUN, VOLUME, Result, ResultDirectory
-from nerif.results.metrics import Metrics
+from nerif.results.metrics_file import Metrics
 
 __all__ = ["Row", "result_table", "rows_of"]
 

@@ -21,7 +21,7 @@ from nerif.common.conventions import DEFAULT_AMBIENT_FACES, InputError, ambient_
 from nerif.common.files import ending
 from nerif.common.netcdf import opened, write_dataset
 from nerif.data.kinds import MEASUREMENT, reading_as
-from nerif.forward.base import ForwardModel
+from nerif.forward.forward_model import ForwardModel
 from nerif.forward.registry import TECHNIQUES, forward_model
 from nerif.geometry import Box, Camera, Rays
 from nerif.geometry.body import Body

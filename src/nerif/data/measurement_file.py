@@ -18,8 +18,8 @@ from nerif.common.memory import check_memory
 from nerif.common.netcdf import reading, values
 from nerif.data.kinds import BOST, known_conventions
 from nerif.data.measurement import MASKS, Measurement, Region
-from nerif.forward.base import ForwardModel
 from nerif.forward.deflection import Deflection
+from nerif.forward.forward_model import ForwardModel
 from nerif.forward.registry import TECHNIQUES, technique
 from nerif.geometry import PERSPECTIVE, Box, Camera, Lens, Plane, Projection, projection_named
 from nerif.geometry.body import Body

@@ -15,7 +15,7 @@ from nerif.common.conventions import InputError, with_unit
 from nerif.common.netcdf import opened, write_dataset
 from nerif.data.measurement import Measurement
 from nerif.data.measurement_file import encoding, from_dataset, to_dataset
-from nerif.forward.base import ForwardModel
+from nerif.forward.forward_model import ForwardModel
 from nerif.forward.registry import ASSUMED
 
 __all__ = ["Accuracy", "Reprojection"]

@@ -17,7 +17,7 @@ from nerif.data.kinds import SEQUENCE_RESULT, TRUE_SEQUENCE, Kind, check_kind, r
 from nerif.data.measurement_sequence import ZARR_FORMAT, add_frames, check_instants, check_store, require_zarr
 from nerif.data.volume import Volume, describe, field_of, name_of
 from nerif.data.volume_file import REFERENCES
-from nerif.forward.base import ForwardModel
+from nerif.forward.forward_model import ForwardModel
 from nerif.forward.registry import ASSUMED, technique
 from nerif.geometry import Box, Grid
 

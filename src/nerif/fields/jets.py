@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from nerif.common.arrays import Points, Values, Vectors
-from nerif.fields.base import Field
+from nerif.fields.field import Field
 from nerif.geometry import Box
 
 __all__ = ["AXISYMMETRIC", "Axisymmetric", "GaussianJet", "Plume", "UnderexpandedJet"]

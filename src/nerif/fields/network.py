@@ -22,7 +22,7 @@ from nerif.common.arrays import Points, Values, Vectors
 from nerif.common.conventions import InputError
 from nerif.common.settings import check_settings
 from nerif.common.transfer import constant
-from nerif.fields.base import Field
+from nerif.fields.field import Field
 from nerif.geometry import Box
 
 __all__ = [

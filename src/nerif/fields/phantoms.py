@@ -19,7 +19,7 @@ from torch import Tensor
 
 from nerif.common.arrays import Points, Values, Vectors
 from nerif.common.conventions import InputError
-from nerif.fields.base import Field
+from nerif.fields.field import Field
 from nerif.fields.jets import AXISYMMETRIC
 from nerif.fields.turbulence import Fire, TurbulentPlume
 from nerif.geometry import Box

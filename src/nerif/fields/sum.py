@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from nerif.common.arrays import Points, Values, Vectors
-from nerif.fields.base import Field
+from nerif.fields.field import Field
 
 __all__ = ["SumField"]
 

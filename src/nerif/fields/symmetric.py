@@ -11,10 +11,10 @@ from torch import Tensor, nn
 
 from nerif.common.arrays import Points, Values, Vectors
 from nerif.common.conventions import InputError
-from nerif.fields.base import Field, in_chunks
-from nerif.fields.grid import VoxelField
+from nerif.fields.field import Field, in_chunks
 from nerif.fields.network import ACTIVATIONS, UNBOUNDED, Network, NetworkShape, NeuralField, encode, encode_pullback
 from nerif.fields.sum import SumField
+from nerif.fields.voxel_field import VoxelField
 from nerif.geometry import Grid
 from nerif.geometry.symmetry import Symmetry
 

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from nerif.common.arrays import Points, Values, Vectors
 from nerif.common.conventions import InputError
-from nerif.fields.base import Field
-from nerif.fields.grid import VoxelField
+from nerif.fields.field import Field
+from nerif.fields.voxel_field import VoxelField
 from nerif.geometry import Box, Grid
 
 __all__ = ["Fire", "TurbulentPlume", "inertial_scalar"]

@@ -19,7 +19,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerif.common.conventions import InputError
-from nerif.forward.base import ForwardModel, Light, Map, Mask, PerRay
+from nerif.forward.forward_model import ForwardModel, Light, Map, Mask, PerRay
 from nerif.forward.line_integral import MAX_NOISE, LineIntegral, share_below
 from nerif.geometry import Rays
 

@@ -16,7 +16,7 @@ from typing import ClassVar
 
 import torch
 
-from nerif.forward.base import ForwardModel, Light, Samples, SampleVectors, Weights
+from nerif.forward.forward_model import ForwardModel, Light, Samples, SampleVectors, Weights
 from nerif.geometry import Rays
 
 __all__ = ["Curved", "Deflection", "LeverArm", "Paraxial"]

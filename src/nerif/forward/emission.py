@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from nerif.common.conventions import InputError
-from nerif.forward.base import ForwardModel, Light, Map, Mask
+from nerif.forward.forward_model import ForwardModel, Light, Map, Mask
 from nerif.forward.line_integral import LineIntegral, share_below
 
 __all__ = ["Emission"]

@@ -26,9 +26,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from nerif.common.conventions import InputError
-from nerif.fields.grid import spline_weights
-from nerif.forward.base import ForwardModel, Light, Map, Mask, PerRay, Samples, Weights, masked_blur
+from nerif.fields.voxel_field import spline_weights
 from nerif.forward.deflection import LeverArm
+from nerif.forward.forward_model import ForwardModel, Light, Map, Mask, PerRay, Samples, Weights, masked_blur
 from nerif.geometry import Rays
 
 __all__ = [

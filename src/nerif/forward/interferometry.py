@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import torch
 
 from nerif.common.conventions import InputError
-from nerif.forward.base import ForwardModel, Light, Map, Mask
+from nerif.forward.forward_model import ForwardModel, Light, Map, Mask
 from nerif.forward.line_integral import GAUSSIAN, LineIntegral
 
 __all__ = ["Interferometry"]

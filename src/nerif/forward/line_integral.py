@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from nerif.forward.base import ForwardModel, Map, Mask, Samples, Weights
+from nerif.forward.forward_model import ForwardModel, Map, Mask, Samples, Weights
 from nerif.geometry import Rays
 
 __all__ = ["MAX_NOISE", "LineIntegral", "share_below"]

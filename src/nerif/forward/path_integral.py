@@ -13,8 +13,8 @@ from torch import Tensor
 
 from nerif.common.conventions import InputError
 from nerif.common.pauses import pause
-from nerif.fields.base import Field
-from nerif.forward.base import ForwardModel, midpoints
+from nerif.fields.field import Field
+from nerif.forward.forward_model import ForwardModel, midpoints
 from nerif.geometry import Rays
 
 __all__ = ["LENS_RAYS", "FieldProjector", "PathIntegral", "places", "project"]

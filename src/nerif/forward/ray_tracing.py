@@ -21,7 +21,7 @@ from torch import Tensor
 
 from nerif.common.conventions import InputError
 from nerif.common.pauses import pause
-from nerif.fields.base import Field
+from nerif.fields.field import Field
 from nerif.forward.path_integral import LENS_RAYS, FieldProjector
 from nerif.geometry import Rays
 

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from nerif.common.conventions import InputError
 from nerif.forward import absorption, deflection
 from nerif.forward.absorption import Absorption
-from nerif.forward.base import ForwardModel, Light
 from nerif.forward.deflection import Deflection
 from nerif.forward.emission import Emission
+from nerif.forward.forward_model import ForwardModel, Light
 from nerif.forward.images import Images
 from nerif.forward.interferometry import Interferometry
 

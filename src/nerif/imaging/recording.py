@@ -16,9 +16,9 @@ from jaxtyping import Bool
 
 from nerif.common.conventions import AMBIENT_INDEX, DEFAULT_AMBIENT_FACES, InputError
 from nerif.common.settings import check_settings
+from nerif.data.cameras_file import CalibratedCamera
 from nerif.data.measurement import Measurement
 from nerif.geometry import Box, Camera
-from nerif.imaging.calibration.cameras_file import CalibratedCamera
 from nerif.imaging.displacement.displacement import (
     OVEREXPOSED,
     UNEVEN,
@@ -26,13 +26,13 @@ from nerif.imaging.displacement.displacement import (
     DisplacementSettings,
     Reference,
 )
-from nerif.imaging.displacement.repetition import Repetition, repetition
-from nerif.imaging.displacement.shake import row_movement
 from nerif.imaging.masks import MaskSettings, flow_mask
+from nerif.imaging.quality.reference_outliers import without_outliers
+from nerif.imaging.quality.repetition import Repetition, repetition
+from nerif.imaging.quality.unrelated import unrelated
 from nerif.imaging.readers.exposure import check_exposure
 from nerif.imaging.readers.views import View, good_images, paired
-from nerif.imaging.reference_outliers import without_outliers
-from nerif.imaging.unrelated import unrelated
+from nerif.imaging.shake import row_movement
 from nerif.imaging.workers import cores, work
 
 __all__ = ["Recording", "Scene", "Surroundings", "ViewReference", "camera_of", "join_views", "measure_instant"]

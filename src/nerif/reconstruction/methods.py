@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from nerif.reconstruction.base import Reconstructor
-from nerif.reconstruction.gaussian_process import GaussianProcess
+from nerif.reconstruction.detail.gaussian_process import GaussianProcess
 from nerif.reconstruction.neural.neural import NeRIF
+from nerif.reconstruction.reconstructor import Reconstructor
 from nerif.reconstruction.voxels.landweber import Landweber
 from nerif.reconstruction.voxels.multiplicative import MART, MLEM
 from nerif.reconstruction.voxels.tikhonov import Tikhonov

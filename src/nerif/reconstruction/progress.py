@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 
-from nerif.reconstruction.base import OnStep, compose
+from nerif.reconstruction.reconstructor import OnStep, compose
 
 __all__ = ["QUIET", "Monitor"]
 

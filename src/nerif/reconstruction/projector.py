@@ -16,8 +16,8 @@ from nerif.common.axis_order import order_remedy
 from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
 from nerif.data.volume import Volume
-from nerif.fields.base import Field
-from nerif.fields.grid import spline_coefficients
+from nerif.fields.field import Field
+from nerif.fields.voxel_field import spline_coefficients
 from nerif.forward.registry import AUTO
 from nerif.geometry import Grid
 from nerif.reconstruction.aperture import apply_aperture

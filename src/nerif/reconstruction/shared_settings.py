@@ -9,9 +9,9 @@ from nerif.common.conventions import ambient_index, parse_faces
 from nerif.common.settings import NonNegative, check_settings
 from nerif.data.measurement import Region, check_region
 from nerif.geometry.symmetry import NO_SYMMETRY, parse_symmetry
-from nerif.reconstruction.base import Reconstructor
 from nerif.reconstruction.bounds import check_bounds
-from nerif.reconstruction.rig.parameters import check_refined
+from nerif.reconstruction.reconstructor import Reconstructor
+from nerif.reconstruction.rig_parameters import check_refined
 
 __all__ = ["SHORT_RUN", "Aperture", "SharedSettings", "Source"]
 

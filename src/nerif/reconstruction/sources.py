@@ -19,7 +19,7 @@ from torch import Tensor
 
 from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement, Observation
-from nerif.forward.base import masked_blur
+from nerif.forward.forward_model import masked_blur
 
 __all__ = ["Stage", "check_source", "of_source", "resolve_source", "stages"]
 

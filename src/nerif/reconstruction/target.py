@@ -12,10 +12,10 @@ from torch import Tensor
 from nerif.common.conventions import InputError
 from nerif.common.transfer import sent
 from nerif.data.measurement import Measurement, Observation
-from nerif.forward.base import ForwardModel
+from nerif.forward.forward_model import ForwardModel
 from nerif.forward.registry import AUTO, forward_models
 from nerif.geometry import Rays
-from nerif.reconstruction.neural.bins import binned_rays, patches
+from nerif.reconstruction.bins import binned_rays, patches
 
 __all__ = ["Part", "Target", "check_target"]
 

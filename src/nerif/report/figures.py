@@ -11,9 +11,9 @@ from nerif.analysis.metrics import LEVELS
 from nerif.data.volume import Volume
 from nerif.geometry import Camera
 from nerif.plotting.drawing import COLOURS, label_of, plain, plotted_quantities, plotted_values
-from nerif.reconstruction.rig.parameters import RefinedView
+from nerif.reconstruction.rig_parameters import RefinedView
 from nerif.reconstruction.uncertainty.deviations import TAILS
-from nerif.results.metrics import ViewScores
+from nerif.results.metrics_file import ViewScores
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

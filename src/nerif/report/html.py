@@ -18,8 +18,8 @@ from nerif.forward.registry import technique_of
 from nerif.plotting.drawing import map_colours, plotted_quantities
 from nerif.plotting.notebook import image, number
 from nerif.report import figures, summary
+from nerif.report.journal_figures import residuals_over_sigma
 from nerif.report.meridian_figure import draw_centre_line, draw_profiles, draw_section
-from nerif.report.pages import residuals_over_sigma
 from nerif.report.scene import scene_of
 from nerif.report.surface_figure import draw_surface
 from nerif.report.view_images import colour_table, view_images

@@ -24,7 +24,7 @@ from nerif.plotting.drawing import (
 )
 from nerif.report import packing
 from nerif.report.isosurface import default_level
-from nerif.report.pages import error_of
+from nerif.report.journal_figures import error_of
 from nerif.report.rig_figure import image_corners
 from nerif.report.view_images import colour_table
 from nerif.results.directory import Result

@@ -20,12 +20,12 @@ from nerif.geometry.symmetry import Axis
 from nerif.physics.quantities import GasChanges
 from nerif.plotting.drawing import LABELS, plotted_quantities, plotted_values
 from nerif.plotting.notebook import number, span
-from nerif.reconstruction.base import END
-from nerif.reconstruction.files import FIELD
-from nerif.reconstruction.rig.parameters import refinement_lines
+from nerif.reconstruction.field_files import FIELD
+from nerif.reconstruction.reconstructor import END
+from nerif.reconstruction.rig_parameters import refinement_lines
 from nerif.report.packing import relation
 from nerif.results.directory import METRICS, VOLUME, Result
-from nerif.results.metrics import ViewScores
+from nerif.results.metrics_file import ViewScores
 
 __all__ = [
     "Statement", "accuracy_rows", "cross_validated", "field_rows", "headline", "measurement_rows", "statements",

@@ -15,7 +15,7 @@ from nerif.common.conventions import unit_shown
 from nerif.data.measurement import Measurement, Observation
 from nerif.data.reprojection import Reprojection
 from nerif.plotting.drawing import map_colours, map_range
-from nerif.results.metrics import ViewScores
+from nerif.results.metrics_file import ViewScores
 
 __all__ = ["Scale", "ViewImages", "colour_table", "image_address", "lattice_step", "view_images"]
 

@@ -26,16 +26,24 @@ from nerif.data.reprojection import Reprojection
 from nerif.data.surface import SurfaceMap
 from nerif.data.volume import INDEX, Volume, field_of
 from nerif.data.volume_file import read_volume, read_volumes
-from nerif.fields.base import Field
+from nerif.fields.field import Field
 from nerif.geometry import Box, Grid
 from nerif.geometry.body import Body
 from nerif.geometry.symmetry import Symmetry
-from nerif.reconstruction import files as field_files
-from nerif.reconstruction.base import Reconstruction, State, sampled
-from nerif.reconstruction.files import CHECKPOINT, FIELD, read_bodies, read_field, read_quantity, read_rig, read_state
+from nerif.reconstruction import field_files
+from nerif.reconstruction.field_files import (
+    CHECKPOINT,
+    FIELD,
+    read_bodies,
+    read_field,
+    read_quantity,
+    read_rig,
+    read_state,
+)
 from nerif.reconstruction.methods import METHODS
-from nerif.reconstruction.rig.parameters import RefinedView
-from nerif.results.metrics import Metrics
+from nerif.reconstruction.reconstructor import Reconstruction, State, sampled
+from nerif.reconstruction.rig_parameters import RefinedView
+from nerif.results.metrics_file import Metrics
 
 __all__ = [
     "CALIBRATION", "FIGURES", "METRICS", "REPORT", "RUN", "SURFACE", "VOLUME", "Gap", "Result", "ResultDirectory",

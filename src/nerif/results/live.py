@@ -26,14 +26,14 @@ from nerif.common.npz import open_npz
 from nerif.common.written_files import WARN, OwnFiles
 from nerif.data.measurement import Measurement, Observation
 from nerif.data.volume import Volume, describe
-from nerif.fields.base import Field
-from nerif.forward.base import ForwardModel
+from nerif.fields.field import Field
+from nerif.forward.forward_model import ForwardModel
 from nerif.forward.path_integral import PathIntegral, project
 from nerif.forward.registry import AUTO, forward_model
 from nerif.geometry import Box, Grid
-from nerif.reconstruction.base import OnStep, Reconstructor, Step, compose, sampled
 from nerif.reconstruction.progress import Monitor
-from nerif.reconstruction.rig.parameters import with_corrections
+from nerif.reconstruction.reconstructor import OnStep, Reconstructor, Step, compose, sampled
+from nerif.reconstruction.rig_parameters import with_corrections
 from nerif.reconstruction.uncertainty.bootstrap import best_covered
 from nerif.results.directory import LIVE, LIVE_FIELD
 

@@ -8,13 +8,13 @@ from typing import Any, TypeAlias
 
 from nerif.common.conventions import InputError
 from nerif.data import kinds
+from nerif.data.cameras_file import CalibratedCamera, read_cameras
 from nerif.data.measurement import Measurement
 from nerif.data.measurement_sequence import MeasurementSequence
 from nerif.data.velocity_sequence import VelocitySequence
 from nerif.data.volume import Volume
 from nerif.data.volume_file import read_volume
 from nerif.data.volume_sequence import VolumeSequence
-from nerif.imaging.calibration.cameras_file import CalibratedCamera, read_cameras
 from nerif.results.directory import Result, ResultDirectory
 
 __all__ = ["Content", "read"]

@@ -18,12 +18,12 @@ from torch import Tensor
 from nerif.common.conventions import InputError
 from nerif.common.files import write_toml
 from nerif.common.written_files import WRITTEN, OwnFiles
+from nerif.data.cameras_file import CalibratedCamera, write_cameras
 from nerif.data.volume import Volume
 from nerif.data.volume_file import write_netcdf
-from nerif.fields.base import Field
+from nerif.fields.field import Field
 from nerif.geometry import Box, Camera, Grid
 from nerif.imaging.calibration.bundle import Pose
-from nerif.imaging.calibration.cameras_file import CalibratedCamera, write_cameras
 from nerif.imaging.calibration.targets import CalibrationTarget
 from nerif.imaging.patterns import Background
 from nerif.simulation.rendering import Sensor, Texture, background_texture, pattern_size, render

@@ -18,7 +18,7 @@ from torch import Tensor
 from nerif.common.arrays import Points
 from nerif.common.conventions import InputError
 from nerif.common.settings import NonNegative, Positive, check_settings
-from nerif.fields.base import Field
+from nerif.fields.field import Field
 from nerif.forward.ray_tracing import trace
 from nerif.geometry import Box, Camera, Lens, Plane, Rays
 from nerif.simulation.simulate import STEPS

@@ -25,10 +25,10 @@ from nerif.data.measurement_sequence import MeasurementSequence
 from nerif.data.volume import INDEX, Volume
 from nerif.data.volume_file import read_volume
 from nerif.data.volume_sequence import VolumeSequence
-from nerif.fields.base import Field
-from nerif.fields.grid import VoxelField
+from nerif.fields.field import Field
 from nerif.fields.phantoms import Scaled, make_phantom
-from nerif.forward.base import ForwardModel
+from nerif.fields.voxel_field import VoxelField
+from nerif.forward.forward_model import ForwardModel
 from nerif.forward.path_integral import PathIntegral, project
 from nerif.forward.ray_tracing import background_points
 from nerif.forward.registry import ASSUMED, TECHNIQUES, check_simulated, forward_model, technique

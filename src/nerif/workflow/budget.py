@@ -14,12 +14,12 @@ from nerif.analysis.prediction import evaluations
 from nerif.data.measurement import Measurement
 from nerif.fields.network_kinds import network_in
 from nerif.geometry import Grid
-from nerif.reconstruction.base import Reconstructor
 from nerif.reconstruction.device import resolve_device
 from nerif.reconstruction.neural.schedule import duration
-from nerif.reconstruction.neural.settings import TrainingSettings
+from nerif.reconstruction.neural.training_settings import TrainingSettings
+from nerif.reconstruction.reconstructor import Reconstructor
 from nerif.reconstruction.shared_settings import SHORT_RUN
-from nerif.reconstruction.voxels.settings import VoxelReconstructor
+from nerif.reconstruction.voxels.voxel_reconstructor import VoxelReconstructor
 
 __all__ = ["NO_LIMIT", "Budget"]
 

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from nerif.common.conventions import InputError
 from nerif.common.files import atomic
 from nerif.data.measurement import Measurement
-from nerif.fields.base import Field
-from nerif.reconstruction.base import OnStep, Outcome, Reconstruction, Reconstructor, State, Step, compose
-from nerif.reconstruction.files import CHECKPOINT, FIELD, checkpoints, digest_of_field, fingerprint, write_state
+from nerif.fields.field import Field
+from nerif.reconstruction.field_files import CHECKPOINT, FIELD, checkpoints, digest_of_field, fingerprint, write_state
 from nerif.reconstruction.progress import QUIET, Monitor
+from nerif.reconstruction.reconstructor import OnStep, Outcome, Reconstruction, Reconstructor, State, Step, compose
 from nerif.results.directory import ResultDirectory
 
 __all__ = ["CheckpointedRun"]

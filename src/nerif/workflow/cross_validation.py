@@ -12,16 +12,16 @@ from nerif.analysis.prediction import reproject
 from nerif.common.conventions import InputError
 from nerif.common.files import read_json, write_json
 from nerif.data.measurement import Measurement
-from nerif.fields.base import Field
-from nerif.reconstruction.base import OnStep, Reconstruction, Reconstructor
-from nerif.reconstruction.files import FIELD
+from nerif.fields.field import Field
+from nerif.reconstruction.field_files import FIELD
 from nerif.reconstruction.progress import QUIET, Monitor
-from nerif.reconstruction.rig.refinement import with_rig
+from nerif.reconstruction.reconstructor import OnStep, Reconstruction, Reconstructor
+from nerif.reconstruction.rig_refinement import with_rig
 from nerif.reconstruction.shared_settings import SharedSettings
-from nerif.reconstruction.symmetry import axis_of, check_views, with_axis
 from nerif.reconstruction.uncertainty.bootstrap import best_covered
+from nerif.reconstruction.voxels.symmetry_axis import axis_of, check_views, with_axis
 from nerif.results.directory import ResultDirectory
-from nerif.results.metrics import WithheldRun
+from nerif.results.metrics_file import WithheldRun
 from nerif.workflow.checkpointed import CheckpointedRun
 
 __all__ = ["AUTO", "MIN_VIEWS", "NONE", "CrossValidation", "ShortFit", "with_halves", "withheld_views"]

@@ -20,26 +20,26 @@ from nerif.common.memory import free_memory
 from nerif.common.settings import NonNegative, check_settings
 from nerif.data.measurement import Measurement
 from nerif.data.volume import Volume, quantities_of
-from nerif.fields.base import Field
+from nerif.fields.field import Field
 from nerif.geometry import Box, Grid
 from nerif.physics.quantities import GasSettings
 from nerif.reconstruction.aperture import apply_aperture
-from nerif.reconstruction.base import VOXELS, OnStep, Reconstruction, Reconstructor, State, Step
-from nerif.reconstruction.detail import Choice, Posterior, check_sigma
-from nerif.reconstruction.files import CHECKPOINT, FIELD
+from nerif.reconstruction.detail.detail import Choice, Posterior, check_sigma
+from nerif.reconstruction.field_files import CHECKPOINT, FIELD
 from nerif.reconstruction.methods import method_name
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.neural.parallel import Ranks
 from nerif.reconstruction.neural.schedule import Pace
 from nerif.reconstruction.progress import QUIET, Monitor
-from nerif.reconstruction.rig.posterior import RigPosterior
+from nerif.reconstruction.reconstructor import VOXELS, OnStep, Reconstruction, Reconstructor, State, Step
 from nerif.reconstruction.shared_settings import SharedSettings
 from nerif.reconstruction.sources import check_source
-from nerif.reconstruction.symmetry import axis_of, too_few_views, with_axis
 from nerif.reconstruction.uncertainty.bootstrap import KINDS, Trials
+from nerif.reconstruction.uncertainty.rig_posterior import RigPosterior
+from nerif.reconstruction.voxels.symmetry_axis import axis_of, too_few_views, with_axis
 from nerif.results.directory import ResultDirectory
 from nerif.results.live import Live
-from nerif.results.metrics import DetailEntries
+from nerif.results.metrics_file import DetailEntries
 from nerif.workflow.budget import Budget
 from nerif.workflow.cross_validation import AUTO, MIN_VIEWS, CrossValidation, with_halves
 

@@ -12,10 +12,10 @@ import torch
 
 from nerif.common.interruption import if_interrupted
 from nerif.data.measurement import Measurement
-from nerif.reconstruction.base import OnStep, Reconstruction, Reconstructor
 from nerif.reconstruction.device import Cores
 from nerif.reconstruction.neural.parallel import Ranks
 from nerif.reconstruction.progress import QUIET, Monitor
+from nerif.reconstruction.reconstructor import OnStep, Reconstruction, Reconstructor
 from nerif.results.directory import ResultDirectory
 from nerif.workflow.job import Job, Run, remedy
 from nerif.workflow.steps import CLOSING, STEPS, Fit, the_result

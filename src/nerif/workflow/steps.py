@@ -18,29 +18,29 @@ import numpy as np
 from nerif.analysis.asymmetry import asymmetry, asymmetry_sentence
 from nerif.analysis.evaluation import evaluate_views, score_lines
 from nerif.analysis.prediction import reproject
-from nerif.analysis.surface import surface_map
 from nerif.analysis.verdict import verdict
+from nerif.analysis.wall_values import surface_map
 from nerif.common.conventions import unit_shown
 from nerif.common.installation import word_of
+from nerif.data.cameras_file import CalibratedCamera, write_cameras
 from nerif.data.measurement import Measurement
 from nerif.data.volume import describe
 from nerif.geometry import Grid
-from nerif.imaging.calibration.cameras_file import CalibratedCamera, write_cameras
 from nerif.physics.quantities import masked_lines
-from nerif.reconstruction.base import Reconstruction, compose
-from nerif.reconstruction.detail import COARSE, EARLY, ITERATIONS, SIGNIFICANT, Choice, Detail, choose
-from nerif.reconstruction.files import FIELD, checkpoints
+from nerif.reconstruction.detail.detail import COARSE, EARLY, ITERATIONS, SIGNIFICANT, Choice, Detail, choose
+from nerif.reconstruction.field_files import FIELD, checkpoints
 from nerif.reconstruction.neural.neural import NeRIF
-from nerif.reconstruction.rig.parameters import refinement_lines, with_corrections
-from nerif.reconstruction.rig.posterior import RigPosterior
-from nerif.reconstruction.rig.refinement import refit, with_rig
+from nerif.reconstruction.reconstructor import Reconstruction, compose
+from nerif.reconstruction.rig_parameters import refinement_lines, with_corrections
+from nerif.reconstruction.rig_refinement import refit, with_rig
 from nerif.reconstruction.shared_settings import SHORT_RUN, SharedSettings
-from nerif.reconstruction.symmetry import axis_of, better_direction
 from nerif.reconstruction.uncertainty.deviations import VOXELS, Deviations
+from nerif.reconstruction.uncertainty.rig_posterior import RigPosterior
+from nerif.reconstruction.voxels.symmetry_axis import axis_of, better_direction
 from nerif.results.directory import CALIBRATION, versions
-from nerif.results.metrics import Metrics
+from nerif.results.metrics_file import Metrics
+from nerif.workflow.bootstrap_runs import Members, all_quantities, write_deviations
 from nerif.workflow.job import Job
-from nerif.workflow.repeats import Members, all_quantities, write_deviations
 from nerif.workflow.reports import write_report
 
 __all__ = ["CLOSING", "STEPS", "PipelineStep"]

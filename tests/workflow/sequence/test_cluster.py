@@ -37,7 +37,7 @@ from nerif.data.measurement_sequence import MeasurementSequence
 from nerif.workflow.sequence import cluster
 from nerif.workflow.sequence.cluster import _gpus, check_workers, open_cluster, read_slurm, slurm_cluster
 from nerif.workflow.sequence.plan import SequenceSettings
-from nerif.workflow.sequence.reconstruct import reconstruct_sequence
+from nerif.workflow.sequence.reconstruct_sequence import reconstruct_sequence
 from nerif.workflow.sequence.store import DONE, FAILED, MISSING, SequenceStore
 from refusals import refused
 

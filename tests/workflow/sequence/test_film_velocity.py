@@ -13,12 +13,12 @@ import zarr
 from commands import run
 from nerif.data.measurement_sequence import MeasurementSequence
 from nerif.data.velocity_sequence import VelocitySequence
+from nerif.flow.assimilation import VelocityFit
 from nerif.geometry import Grid
-from nerif.reconstruction.velocity.assimilation import VelocityFit
-from nerif.workflow.sequence.frames import reconstruct_frames
+from nerif.workflow.film_velocity import velocity_of_film
+from nerif.workflow.sequence.chunk import reconstruct_frames
 from nerif.workflow.sequence.plan import SequencePlan, SequenceSettings
 from nerif.workflow.sequence.store import SequenceStore
-from nerif.workflow.velocity import velocity_of_film
 from refusals import refused
 from sequence_films import COLD
 

@@ -17,11 +17,11 @@ from nerif.common.conventions import InputError
 from nerif.data.measurement_sequence import MeasurementSequence
 from nerif.fields.symmetric import symmetry_of_field
 from nerif.geometry import Grid
-from nerif.reconstruction.symmetry import with_axis
-from nerif.workflow.sequence import frames
-from nerif.workflow.sequence.frames import reconstruct_frames
+from nerif.reconstruction.voxels.symmetry_axis import with_axis
+from nerif.workflow.sequence import chunk as frames
+from nerif.workflow.sequence.chunk import reconstruct_frames
 from nerif.workflow.sequence.plan import SequencePlan, SequenceSettings
-from nerif.workflow.sequence.reconstruct import _store
+from nerif.workflow.sequence.reconstruct_sequence import _store
 from nerif.workflow.sequence.run import chunks_of, outcome_table
 from nerif.workflow.sequence.store import DONE, FAILED, MISSING, SequenceStore
 from refusals import refused

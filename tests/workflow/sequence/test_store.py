@@ -26,10 +26,10 @@ from nerif.geometry import Box, Grid, Ring
 from nerif.report.movie import Movie
 from nerif.report.sequence_page import render_sequence
 from nerif.simulation.simulate import Simulation
-from nerif.workflow.sequence.evaluation import evaluate_sequence
-from nerif.workflow.sequence.frames import finished_frame
+from nerif.workflow.sequence.chunk import finished_frame
 from nerif.workflow.sequence.plan import SequencePlan, SequenceSettings
 from nerif.workflow.sequence.run import outcome_table
+from nerif.workflow.sequence.sequence_evaluation import evaluate_sequence
 from nerif.workflow.sequence.store import SequenceStore
 from refusals import refused
 from sequence_films import COLD, RIG, blank

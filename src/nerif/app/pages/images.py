@@ -13,7 +13,7 @@ from nerif.app.elements import CommandLine, card, items_html, refusals, select, 
 from nerif.app.page import Hint, Page
 from nerif.app.workspace import Workspace
 from nerif.common.conventions import InputError
-from nerif.imaging.image_quality import ImageQuality
+from nerif.imaging.quality.image_quality import ImageQuality
 from nerif.imaging.readers.views import View
 
 __all__ = ["PAGE"]

@@ -16,10 +16,10 @@ from nerif.cli.commands.output import counting_bar, say
 from nerif.cli.commands.settings import Flat, Settings, command
 from nerif.common.conventions import InputError
 from nerif.common.files import ending
+from nerif.data.cameras_file import CalibratedCamera, write_cameras
 from nerif.data.measurement import Measurement
 from nerif.geometry import Box, Camera
 from nerif.imaging.calibration.calibrate import CalibrationSettings, calibrate_views, target_images
-from nerif.imaging.calibration.cameras_file import CalibratedCamera, write_cameras
 from nerif.imaging.calibration.importers.importers import ImportSettings, import_box, import_cameras, is_calibration
 from nerif.imaging.calibration.result import MOUNT, Calibration
 from nerif.imaging.calibration.simple_rig import SimpleRig, box_about_axis, find_image, simple_camera

@@ -15,7 +15,7 @@ from nerif.cli.commands.settings import Settings, command
 from nerif.common.conventions import InputError
 from nerif.common.files import ending
 from nerif.data.volume import INDEX, name_of
-from nerif.results.metrics import ViewScores
+from nerif.results.metrics_file import ViewScores
 
 __all__ = ["Evaluate", "main", "run"]
 
@@ -87,7 +87,7 @@ def _print_views(views: list[ViewScores]) -> None:
 
 
 def _run_over_time(settings: Evaluate) -> dict[str, Any]:
-    from nerif.workflow.sequence.evaluation import evaluate_sequence
+    from nerif.workflow.sequence.sequence_evaluation import evaluate_sequence
 
     if settings.truth is None or replace(settings, truth=None) != Evaluate(settings.result):
         raise InputError(

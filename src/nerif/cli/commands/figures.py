@@ -12,7 +12,7 @@ from annotated_types import Ge, Le
 from nerif.cli.commands.output import counting_bar, say
 from nerif.cli.commands.settings import Settings, command
 from nerif.common.conventions import InputError
-from nerif.report.pages import JOURNALS, save_figures
+from nerif.report.journal_figures import JOURNALS, save_figures
 from nerif.results.directory import FIGURES, ResultDirectory
 
 __all__ = ["Figures", "main", "run"]

@@ -12,8 +12,8 @@ from contextlib import contextmanager
 from nerif.cli.closed_output import is_closed_output, silence
 from nerif.common.conventions import printable
 from nerif.common.interruption import SIGNALS, received
-from nerif.reconstruction.base import OnStep, Step, compose
 from nerif.reconstruction.progress import Monitor
+from nerif.reconstruction.reconstructor import OnStep, Step, compose
 
 __all__ = ["MONITOR", "counting_bar", "figures_bar", "say"]
 

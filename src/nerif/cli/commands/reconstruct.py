@@ -21,10 +21,10 @@ from nerif.cli.commands.settings import Flat, Settings, read_settings, setting_o
 from nerif.common.conventions import InputError
 from nerif.common.installation import install
 from nerif.common.settings import Count
-from nerif.reconstruction.base import OnStep, Reconstruction, Reconstructor, Step
 from nerif.reconstruction.methods import METHODS
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.neural.presets import PRESETS, preset
+from nerif.reconstruction.reconstructor import OnStep, Reconstruction, Reconstructor, Step
 from nerif.results.directory import RUN
 from nerif.workflow.job import Run
 from nerif.workflow.pipeline import reconstruct_into

@@ -13,11 +13,11 @@ from nerif.cli.commands import velocity
 from nerif.cli.commands.help import after_help
 from nerif.cli.commands.output import MONITOR, figures_bar
 from nerif.cli.commands.settings import Flat, Settings, read_settings, setting_of
+from nerif.flow.assimilation import VelocityFit
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.neural.presets import PRESETS, preset
-from nerif.reconstruction.velocity.assimilation import VelocityFit
 from nerif.workflow.sequence.plan import SequenceSettings
-from nerif.workflow.sequence.reconstruct import reconstruct_sequence
+from nerif.workflow.sequence.reconstruct_sequence import reconstruct_sequence
 from nerif.workflow.sequence.run import Progress
 from nerif.workflow.sequence.store import DONE, MISSING, SequenceStore
 

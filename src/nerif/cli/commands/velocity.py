@@ -15,9 +15,9 @@ from nerif.cli.commands.settings import Flat, Settings, command
 from nerif.common.conventions import InputError
 from nerif.data.velocity_sequence import VelocitySequence
 from nerif.data.volume import INDEX
-from nerif.reconstruction.velocity.assimilation import Iterate, VelocityFit
+from nerif.flow.assimilation import Iterate, VelocityFit
+from nerif.workflow.film_velocity import DENSITY, velocity_of_film
 from nerif.workflow.reports import write_sequence_report
-from nerif.workflow.velocity import DENSITY, velocity_of_film
 
 __all__ = ["Velocity", "check", "main", "run"]
 

@@ -13,9 +13,9 @@ from jaxtyping import Float
 
 from nerif.common.conventions import InputError
 from nerif.common.files import read_toml
+from nerif.data.cameras_file import CalibratedCamera, write_cameras
 from nerif.geometry import PERSPECTIVE, Box, Lens, Plane, Projection
 from nerif.imaging.calibration.bundle import INTRINSIC, Bundle, Observation, Pose, crossing
-from nerif.imaging.calibration.cameras_file import CalibratedCamera, write_cameras
 
 __all__ = ["MOUNT", "Calibration", "FittedPlane", "ImageError", "read_errors", "rms_of"]
 

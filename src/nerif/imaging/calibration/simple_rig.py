@@ -20,8 +20,8 @@ from jaxtyping import Float
 
 from nerif.common.conventions import InputError
 from nerif.common.settings import Length, check_settings
+from nerif.data.cameras_file import CalibratedCamera, check_camera
 from nerif.geometry import Box, Lens, Plane
-from nerif.imaging.calibration.cameras_file import CalibratedCamera, check_camera
 from nerif.imaging.calibration.importers.importers import ImportSettings
 from nerif.imaging.readers.open import open_frames
 from nerif.imaging.readers.views import find_views

@@ -20,8 +20,8 @@ import numpy as np
 
 from nerif.common.conventions import InputError
 from nerif.imaging.displacement.warping import warp
+from nerif.imaging.quality.thumbnails import binned
 from nerif.imaging.readers.frames import as_float
-from nerif.imaging.thumbnails import binned
 
 __all__ = ["Vectors", "correlate", "normalised_median_outliers", "window_correlation"]
 

@@ -23,14 +23,14 @@ from jaxtyping import Bool, Float, Shaped
 
 from nerif.common.conventions import InputError
 from nerif.common.settings import Positive, check_settings
-from nerif.imaging.displacement.noise import FLOOR, local_correlation, smoothing_error, structure_variance
 from nerif.imaging.displacement.optical_flow import FLOWS
 from nerif.imaging.displacement.photometry import CameraNoise, ImagePair
-from nerif.imaging.displacement.shake import border, remove_shake
 from nerif.imaging.displacement.warping import warp
+from nerif.imaging.noise import FLOOR, local_correlation, smoothing_error, structure_variance
+from nerif.imaging.quality.thumbnails import Thumbnail, common_shift
 from nerif.imaging.readers.exposure import saturated
 from nerif.imaging.readers.frames import as_float
-from nerif.imaging.thumbnails import Thumbnail, common_shift
+from nerif.imaging.shake import border, remove_shake
 
 __all__ = [
     "OVEREXPOSED", "DisplacementMap", "DisplacementSettings", "Reference", "displacement", "measure",

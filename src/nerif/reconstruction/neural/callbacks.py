@@ -19,15 +19,15 @@ import torch
 from torch import Tensor
 
 from nerif.common.pauses import pause
-from nerif.fields.base import Field
+from nerif.fields.field import Field
 from nerif.forward.path_integral import PathIntegral, project
 from nerif.geometry import Rays
-from nerif.reconstruction.base import OnStep, Outcome, State, Step
 from nerif.reconstruction.neural.losses import DATA_TERMS
 from nerif.reconstruction.neural.sampling import sample_rays
 from nerif.reconstruction.neural.schedule import Resumable
 from nerif.reconstruction.neural.warm_start import copy_weights, fit_network
-from nerif.reconstruction.rig.refinement import MOMENTUM
+from nerif.reconstruction.reconstructor import OnStep, Outcome, State, Step
+from nerif.reconstruction.rig_refinement import MOMENTUM
 from nerif.reconstruction.target import Part
 
 if TYPE_CHECKING:

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from nerif.common.conventions import InputError
 from nerif.fields.network import Network, NeuralField
-from nerif.forward.base import Weights
+from nerif.forward.forward_model import Weights
 from nerif.forward.path_integral import places
 from nerif.geometry import Rays
 from nerif.reconstruction.device import autocast_dtype, float32_products, keep_compiled_code_private

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from nerif.data.measurement import Measurement
-from nerif.fields.base import Field
-from nerif.reconstruction.base import OnStep, Reconstruction, State
-from nerif.reconstruction.neural.settings import TrainingSettings
+from nerif.fields.field import Field
 from nerif.reconstruction.neural.trainer import Trainer
 from nerif.reconstruction.neural.training_data import TrainingData
+from nerif.reconstruction.neural.training_settings import TrainingSettings
+from nerif.reconstruction.reconstructor import OnStep, Reconstruction, State
 
 __all__ = ["NeRIF"]
 

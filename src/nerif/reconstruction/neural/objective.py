@@ -10,8 +10,8 @@ from nerif.fields.network import NeuralField
 from nerif.forward.path_integral import LENS_RAYS
 from nerif.reconstruction.neural.losses import DATA_TERMS, MixedPrecision, loss_terms, reduce
 from nerif.reconstruction.neural.sampling import Batch, Draw, SamplingDensity, sample_rays
-from nerif.reconstruction.neural.settings import TrainingSettings
 from nerif.reconstruction.neural.training_data import TrainingData, shuffled
+from nerif.reconstruction.neural.training_settings import TrainingSettings
 from nerif.reconstruction.target import Part
 
 __all__ = ["Objective"]

@@ -21,8 +21,8 @@ from nerif.geometry import Rays
 from nerif.reconstruction.neural.losses import Evaluator, MixedPrecision
 from nerif.reconstruction.neural.parallel import Ranks
 from nerif.reconstruction.neural.schedule import Schedule
-from nerif.reconstruction.neural.settings import TrainingSettings
 from nerif.reconstruction.neural.training_data import TrainingData, shuffled
+from nerif.reconstruction.neural.training_settings import TrainingSettings
 from nerif.reconstruction.target import Part
 
 __all__ = ["Batch", "Draw", "Piece", "Sampler", "SamplingDensity", "sample_count", "sample_rays"]

@@ -24,9 +24,9 @@ from typing import Any, ClassVar
 
 import torch
 
-from nerif.reconstruction.base import Outcome, Reconstructor, Step
 from nerif.reconstruction.neural.parallel import Ranks
-from nerif.reconstruction.neural.settings import TrainingSettings
+from nerif.reconstruction.neural.training_settings import TrainingSettings
+from nerif.reconstruction.reconstructor import Outcome, Reconstructor, Step
 
 __all__ = ["Cycles", "Pace", "Schedule", "duration"]
 

@@ -15,12 +15,11 @@ import torch
 from torch import Tensor
 
 from nerif.common.conventions import InputError
-from nerif.fields.base import Field
+from nerif.fields.field import Field
 from nerif.fields.network import UNBOUNDED
-from nerif.reconstruction.base import OnStep, Outcome, Reconstruction, State
 from nerif.reconstruction.bounds import check_same_bounds
 from nerif.reconstruction.device import Cores, float32_products, peak_memory
-from nerif.reconstruction.files import check_fingerprint
+from nerif.reconstruction.field_files import check_fingerprint
 from nerif.reconstruction.neural.callbacks import (
     Bins,
     Callback,
@@ -41,8 +40,9 @@ from nerif.reconstruction.neural.optimiser import NetworkOptimiser
 from nerif.reconstruction.neural.parallel import Ranks
 from nerif.reconstruction.neural.sampling import Batch, Sampler
 from nerif.reconstruction.neural.schedule import Schedule
-from nerif.reconstruction.neural.settings import TrainingSettings
 from nerif.reconstruction.neural.training_data import TrainingData
+from nerif.reconstruction.neural.training_settings import TrainingSettings
+from nerif.reconstruction.reconstructor import OnStep, Outcome, Reconstruction, State
 
 __all__ = ["Trainer"]
 

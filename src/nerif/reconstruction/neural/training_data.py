@@ -21,19 +21,19 @@ from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
 from nerif.fields.network import NeuralField
 from nerif.fields.network_kinds import network_in
-from nerif.forward.base import ForwardModel
+from nerif.forward.forward_model import ForwardModel
 from nerif.reconstruction.aperture import apply_aperture, lens_rays
+from nerif.reconstruction.bins import coarsest_edge, withhold_pixels
 from nerif.reconstruction.bounds import field_bounds, in_units
 from nerif.reconstruction.device import resolve_device
-from nerif.reconstruction.files import fingerprint
+from nerif.reconstruction.field_files import fingerprint
 from nerif.reconstruction.gauge import Gauge, is_open, with_gauge
-from nerif.reconstruction.neural.bins import coarsest_edge, withhold_pixels
-from nerif.reconstruction.neural.settings import TrainingSettings
-from nerif.reconstruction.rig.parameters import RefinedView, refined_groups
-from nerif.reconstruction.rig.refinement import Refinement, load_rig, random_pixels, rig_state
+from nerif.reconstruction.neural.training_settings import TrainingSettings
+from nerif.reconstruction.rig_parameters import RefinedView, refined_groups
+from nerif.reconstruction.rig_refinement import Refinement, load_rig, random_pixels, rig_state
 from nerif.reconstruction.sources import of_source, resolve_source, stages
-from nerif.reconstruction.symmetry import axis_of
 from nerif.reconstruction.target import Part, Target, check_target
+from nerif.reconstruction.voxels.symmetry_axis import axis_of
 
 __all__ = ["TrainingData", "shuffled"]
 

@@ -14,7 +14,7 @@ from functools import partial
 import torch
 from torch import nn
 
-from nerif.fields.base import Field
+from nerif.fields.field import Field
 from nerif.fields.network import UNBOUNDED, NeuralField
 from nerif.fields.symmetric import SymmetricNetwork
 from nerif.reconstruction.neural.losses import Evaluator

@@ -35,15 +35,15 @@ from torch import Tensor
 from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
 from nerif.data.volume import Volume
-from nerif.fields.base import Field
-from nerif.fields.grid import VoxelField
+from nerif.fields.field import Field
+from nerif.fields.voxel_field import VoxelField
 from nerif.geometry import Camera, Grid
 from nerif.geometry.body import contained
 from nerif.physics.quantities import GasSettings
-from nerif.reconstruction.base import Reconstruction, Reconstructor
-from nerif.reconstruction.rig.parameters import with_corrections
-from nerif.reconstruction.rig.posterior import RigPosterior
+from nerif.reconstruction.reconstructor import Reconstruction, Reconstructor
+from nerif.reconstruction.rig_parameters import with_corrections
 from nerif.reconstruction.uncertainty.deviations import VOXELS, Deviations, blurred
+from nerif.reconstruction.uncertainty.rig_posterior import RigPosterior
 
 __all__ = ["KINDS", "BootstrapDeviations", "Maps", "Member", "Original", "Trials", "best_covered"]
 

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerif.data.volume import Volume, describe
-from nerif.fields.grid import VoxelField
+from nerif.fields.voxel_field import VoxelField
 from nerif.geometry import Grid
 from nerif.geometry.body import Body, contained
 from nerif.physics.quantities import GasSettings, derive, deviation

@@ -26,27 +26,27 @@ from torch import Tensor
 from nerif.common.conventions import InputError
 from nerif.common.pauses import pause
 from nerif.data.measurement import Measurement
-from nerif.fields.base import Field
+from nerif.fields.field import Field
 from nerif.geometry import Grid
 from nerif.reconstruction.aperture import apply_aperture
-from nerif.reconstruction.base import OnStep, Outcome, Reconstruction, State, Step
+from nerif.reconstruction.bins import pixel_subset
 from nerif.reconstruction.bounds import field_bounds
 from nerif.reconstruction.device import Cores, available_memory, peak_memory, resolve_device
-from nerif.reconstruction.files import check_fingerprint, fingerprint
+from nerif.reconstruction.field_files import check_fingerprint, fingerprint
 from nerif.reconstruction.gauge import Gauge, check_gauge, is_open, with_gauge
-from nerif.reconstruction.neural.bins import pixel_subset
-from nerif.reconstruction.rig.parameters import RefinedView
-from nerif.reconstruction.rig.refinement import MOMENTUM, Refinement, load_rig, random_pixels, rig_state
+from nerif.reconstruction.reconstructor import OnStep, Outcome, Reconstruction, State, Step
+from nerif.reconstruction.rig_parameters import RefinedView
+from nerif.reconstruction.rig_refinement import MOMENTUM, Refinement, load_rig, random_pixels, rig_state
 from nerif.reconstruction.sources import of_source
-from nerif.reconstruction.symmetry import axis_of
 from nerif.reconstruction.target import Target
 from nerif.reconstruction.voxels.layout import layout_of
 from nerif.reconstruction.voxels.levels import Level, coarser, levels
-from nerif.reconstruction.voxels.problem import Iterate, Problem
+from nerif.reconstruction.voxels.symmetry_axis import axis_of
+from nerif.reconstruction.voxels.voxel_problem import Iterate, Problem
 from nerif.reconstruction.voxels.weight import COARSE_WEIGHT, DISCREPANCY, choose_weight
 
 if TYPE_CHECKING:
-    from nerif.reconstruction.voxels.settings import VoxelReconstructor
+    from nerif.reconstruction.voxels.voxel_reconstructor import VoxelReconstructor
 
 __all__ = ["Descent"]
 

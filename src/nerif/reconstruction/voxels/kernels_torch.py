@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerif.fields.grid import spline_weights
+from nerif.fields.voxel_field import spline_weights
 
 __all__ = ["integrate", "spread"]
 

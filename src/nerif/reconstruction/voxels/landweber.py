@@ -14,8 +14,8 @@ from torch import Tensor
 from nerif.common.conventions import InputError
 from nerif.common.settings import NonNegative
 from nerif.reconstruction.voxels.operator import operator_norm
-from nerif.reconstruction.voxels.problem import Iterate, Problem
-from nerif.reconstruction.voxels.settings import VoxelReconstructor
+from nerif.reconstruction.voxels.voxel_problem import Iterate, Problem
+from nerif.reconstruction.voxels.voxel_reconstructor import VoxelReconstructor
 
 __all__ = ["Landweber"]
 

@@ -12,10 +12,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerif.data.measurement import Measurement
-from nerif.fields.base import Field
-from nerif.fields.grid import DEGREES, Boundary, VoxelField, spline_coefficients
+from nerif.fields.field import Field
 from nerif.fields.symmetric import SymmetricVoxels
-from nerif.forward.base import ForwardModel
+from nerif.fields.voxel_field import DEGREES, Boundary, VoxelField, spline_coefficients
+from nerif.forward.forward_model import ForwardModel
 from nerif.geometry import Box, Grid, Rays
 from nerif.geometry.symmetry import Axis, Symmetry
 from nerif.reconstruction.gauge import free_voxels

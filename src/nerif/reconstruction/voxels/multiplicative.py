@@ -22,8 +22,8 @@ from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
 from nerif.geometry import Grid
 from nerif.reconstruction.voxels.operator import VoxelOperator
-from nerif.reconstruction.voxels.problem import Iterate, Problem
-from nerif.reconstruction.voxels.settings import VoxelReconstructor
+from nerif.reconstruction.voxels.voxel_problem import Iterate, Problem
+from nerif.reconstruction.voxels.voxel_reconstructor import VoxelReconstructor
 
 __all__ = ["MART", "MLEM"]
 

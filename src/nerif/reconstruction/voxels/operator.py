@@ -11,8 +11,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerif.common.conventions import InputError
-from nerif.fields.grid import DEGREES, Boundary, VoxelField
-from nerif.forward.base import ForwardModel
+from nerif.fields.voxel_field import DEGREES, Boundary, VoxelField
+from nerif.forward.forward_model import ForwardModel
 from nerif.geometry import Grid, Rays
 from nerif.reconstruction.device import share_threads
 from nerif.reconstruction.voxels.planes import Bundle
@@ -30,7 +30,7 @@ class VoxelOperator:
 
         (A c)_r = sum_m w_rm [A_r f(x_rm) + B_r grad f(x_rm)],    f(x) = sum_ijk c_ijk b_ijk(x)
 
-    Profile w, A and B are the model's (forward/base.py); samples lie where rays cross evenly spaced planes (planes.py).
+    Profile w, A and B are the model's (forward/forward_model.py); samples lie where rays cross evenly spaced planes.
     `A(c)` applies the operator, `A.T(y)` its exact adjoint: on a CPU by Numba on all cores, on CUDA in PyTorch. A pixel
     with a lens is the mean over thin rays, the more the wider its cone.
 

@@ -15,8 +15,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from nerif.common.conventions import InputError
-from nerif.fields.grid import spline_weights
-from nerif.forward.base import ForwardModel, Weights
+from nerif.fields.voxel_field import spline_weights
+from nerif.forward.forward_model import ForwardModel, Weights
 from nerif.geometry import Grid, Rays
 
 __all__ = ["Bundle", "Planes", "profiles"]

@@ -10,9 +10,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerif.fields.grid import DEGREES, Boundary, VoxelField
 from nerif.fields.symmetric import SymmetricVoxels
-from nerif.forward.base import ForwardModel
+from nerif.fields.voxel_field import DEGREES, Boundary, VoxelField
+from nerif.forward.forward_model import ForwardModel
 from nerif.geometry import Grid, Rays
 from nerif.geometry.symmetry import Symmetry
 from nerif.reconstruction.device import share_threads

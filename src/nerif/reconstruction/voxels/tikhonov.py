@@ -11,8 +11,8 @@ from typing import ClassVar, Literal
 
 from torch import Tensor
 
-from nerif.reconstruction.voxels.problem import Iterate, Penalty, Problem, minimise
-from nerif.reconstruction.voxels.settings import WeightedVoxelReconstructor
+from nerif.reconstruction.voxels.voxel_problem import Iterate, Penalty, Problem, minimise
+from nerif.reconstruction.voxels.voxel_reconstructor import WeightedVoxelReconstructor
 
 __all__ = ["Tikhonov"]
 

@@ -15,8 +15,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerif.common.conventions import InputError
-from nerif.reconstruction.voxels.problem import Iterate, Penalty, Problem, minimise
-from nerif.reconstruction.voxels.settings import WeightedVoxelReconstructor
+from nerif.reconstruction.voxels.voxel_problem import Iterate, Penalty, Problem, minimise
+from nerif.reconstruction.voxels.voxel_reconstructor import WeightedVoxelReconstructor
 
 __all__ = ["TotalVariation", "at_faces", "gradient_square"]
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 
 from torch import Tensor
 
-from nerif.reconstruction.voxels.problem import Iterate
+from nerif.reconstruction.voxels.voxel_problem import Iterate
 
 __all__ = ["COARSE_WEIGHT", "DISCREPANCY", "Choice", "choose_weight", "sharpest_corner"]
 

@@ -15,7 +15,7 @@ import torch
 from nerif.common.conventions import with_unit
 from nerif.common.files import DISK_FULL
 from nerif.reconstruction.device import keep_freed_memory
-from nerif.workflow.sequence.frames import ATTEMPTS, reconstruct_frames
+from nerif.workflow.sequence.chunk import ATTEMPTS, reconstruct_frames
 from nerif.workflow.sequence.plan import SequencePlan
 from nerif.workflow.sequence.store import DONE, FAILED, MISSING, SequenceStore
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from nerif.common.conventions import InputError
-from nerif.imaging.calibration.cameras_file import CalibratedCamera
+from nerif.data.cameras_file import CalibratedCamera
 from nerif.imaging.calibration.importers.names import named_by_images
 
 __all__ = ["COLMAP", "read_colmap"]

@@ -15,9 +15,9 @@ import numpy as np
 
 from nerif.common.conventions import InputError
 from nerif.common.npz import open_npz
+from nerif.data.cameras_file import CalibratedCamera
 from nerif.geometry.astra import camera_of, from_astra
 from nerif.geometry.tigre import from_tigre
-from nerif.imaging.calibration.cameras_file import CalibratedCamera
 from nerif.imaging.calibration.importers.names import UNNAMED
 
 __all__ = ["read_geometry"]

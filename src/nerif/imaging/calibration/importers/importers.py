@@ -18,10 +18,10 @@ from annotated_types import Ge, Lt
 from nerif.common.conventions import InputError
 from nerif.common.files import check_file, ending
 from nerif.common.settings import Positive, check_settings
+from nerif.data.cameras_file import CalibratedCamera, check_camera, check_names, read_box
 from nerif.data.kinds import ARRAYS, CALIBRATION, IMAGES, reading_as
 from nerif.geometry import Box, Lens, Plane
 from nerif.geometry.distortion import POWERS
-from nerif.imaging.calibration.cameras_file import CalibratedCamera, check_camera, check_names, read_box
 from nerif.imaging.calibration.importers.colmap import COLMAP, read_colmap
 from nerif.imaging.calibration.importers.geometry_files import read_geometry
 from nerif.imaging.calibration.importers.matlab import read_matlab

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from nerif.common.conventions import InputError
-from nerif.imaging.calibration.cameras_file import CalibratedCamera, check_model, flat, numbers
+from nerif.data.cameras_file import CalibratedCamera, check_model, flat, numbers
 
 __all__ = ["is_kalibr", "read_kalibr"]
 

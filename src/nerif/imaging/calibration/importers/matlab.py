@@ -27,7 +27,7 @@ import numpy as np
 from nerif.common.conventions import InputError
 from nerif.common.hdf5 import open_hdf5
 from nerif.common.memory import check_memory
-from nerif.imaging.calibration.cameras_file import CalibratedCamera, check_distortion, check_model, flat, numbers
+from nerif.data.cameras_file import CalibratedCamera, check_distortion, check_model, flat, numbers
 from nerif.imaging.calibration.importers.names import UNNAMED
 
 __all__ = ["read_matlab"]

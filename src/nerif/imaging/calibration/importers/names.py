@@ -10,7 +10,7 @@ from pathlib import PurePosixPath
 import torch
 
 from nerif.common.conventions import InputError
-from nerif.imaging.calibration.cameras_file import CalibratedCamera
+from nerif.data.cameras_file import CalibratedCamera
 
 __all__ = ["UNNAMED", "cameras_by_view", "named_by_images"]
 

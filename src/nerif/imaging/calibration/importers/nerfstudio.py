@@ -10,7 +10,7 @@ import torch
 
 from nerif.common.conventions import InputError
 from nerif.common.files import read_json
-from nerif.imaging.calibration.cameras_file import (
+from nerif.data.cameras_file import (
     CalibratedCamera,
     check_distortion,
     check_model,

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from nerif.common.conventions import InputError
-from nerif.imaging.calibration.cameras_file import (
+from nerif.data.cameras_file import (
     CalibratedCamera,
     check_distortion,
     check_model,

@@ -24,7 +24,7 @@ from jaxtyping import Float
 
 from nerif.common.conventions import InputError
 from nerif.common.files import ending
-from nerif.imaging.calibration.cameras_file import CalibratedCamera
+from nerif.data.cameras_file import CalibratedCamera
 
 __all__ = ["ORI", "read_openptv"]
 

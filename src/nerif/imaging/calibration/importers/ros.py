@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from nerif.common.conventions import InputError
-from nerif.imaging.calibration.cameras_file import CalibratedCamera, check_model, flat
+from nerif.data.cameras_file import CalibratedCamera, check_model, flat
 
 __all__ = ["is_ros", "read_ros"]
 

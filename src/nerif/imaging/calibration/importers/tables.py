@@ -12,8 +12,8 @@ from typing import Any
 
 from nerif.common.conventions import InputError
 from nerif.common.files import check_known, read_toml
+from nerif.data.cameras_file import FORMAT, CalibratedCamera, check_model, numbers, read_cameras
 from nerif.geometry import PERSPECTIVE
-from nerif.imaging.calibration.cameras_file import FORMAT, CalibratedCamera, check_model, numbers, read_cameras
 from nerif.imaging.calibration.importers.names import UNNAMED
 
 __all__ = ["read_csv", "read_tables"]

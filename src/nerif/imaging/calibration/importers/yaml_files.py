@@ -8,7 +8,7 @@ from typing import Any
 
 from nerif.common.conventions import InputError
 from nerif.common.files import ending, read_yaml
-from nerif.imaging.calibration.cameras_file import CalibratedCamera
+from nerif.data.cameras_file import CalibratedCamera
 from nerif.imaging.calibration.importers.kalibr import is_kalibr, read_kalibr
 from nerif.imaging.calibration.importers.opencv import read_opencv, read_storage
 from nerif.imaging.calibration.importers.ros import is_ros, read_ros

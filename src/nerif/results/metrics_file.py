@@ -1,0 +1,270 @@
+"""metrics.json: the figures of a result, each section written by one step and read from here by all others."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Annotated, Any, Literal, NotRequired
+
+from pydantic import BeforeValidator, ConfigDict, TypeAdapter, ValidationError, with_config
+from typing_extensions import TypedDict
+
+from nerif.common.conventions import InputError
+from nerif.common.files import read_json, write_json
+from nerif.reconstruction.rig_parameters import RefinedView
+
+__all__ = [
+    "VERSION", "AxisEstimate", "Coverage", "DetailEntries", "HalfAsymmetry", "Metrics", "PredictionAccuracy",
+    "ResidualTest", "SliceScores", "Uncertainty", "VerdictEntries", "ViewScores", "WithheldRun",
+]  # fmt: skip
+
+VERSION = 1
+Score = Annotated[float, BeforeValidator(lambda value: math.nan if value is None else value)]
+"""A figure; NaN (null in the file) where it is not defined, such as the correlation with a constant."""
+
+
+class ResidualTest(TypedDict):
+    """Test of the residual of a view for whiteness."""
+
+    white: bool
+    grain: float
+    """1 for white noise, larger for correlated residuals."""
+    cause: str
+    """Whose pattern it has (remedies.CAUSES), or empty."""
+    share: float
+    """Of the correlated part that the cause explains."""
+    row: float
+    column: float
+    """Of its largest part, px."""
+    correlated: float
+    """The spatially correlated part over the rms."""
+
+
+class ViewScores(TypedDict):
+    """Measurement of a view against its prediction, for one technique."""
+
+    name: str
+    withheld: bool
+    measured: str
+    """The quantity."""
+    unit: str
+    """Of all rms values."""
+    cc: Score
+    ssim: Score
+    psnr: Score
+    """dB."""
+    rms: Score
+    """Of the residual."""
+    pixels: int
+    rms_predicted: Score
+    rms_measured: Score
+    rms_white: NotRequired[Score]
+    """Pixel-to-pixel noise, estimated from the residual."""
+    rms_sigma: NotRequired[Score]
+    """Stated noise."""
+    rms_over_sigma: NotRequired[Score]
+    residual_test: NotRequired[ResidualTest]
+    """Given enough pixels."""
+    cut_edge: NotRequired[str]
+    """Edge of the image, left, right, top or bottom, at which the flow is cut off most."""
+    cut_signal: NotRequired[Score]
+    """Rms of the signal along it over that of the image."""
+
+
+class PredictionAccuracy(TypedDict):
+    """How the views were predicted, for one technique."""
+
+    measured: str
+    unit: str
+    method: str
+    error: float
+    """Rms difference from the path integral through the field; 0 if the prediction is that integral."""
+    pixels: int
+    """Pixels on which they were compared."""
+
+
+class WithheldRun(TypedDict):
+    """Cross-validation: the first run, without one view."""
+
+    views: list[ViewScores]
+    """Of the withheld view."""
+    fitted_views: list[ViewScores]
+    """Of one of the others."""
+    seconds: float
+
+
+class AxisEstimate(TypedDict):
+    """The axis of a symmetric flow; parameters by name, mm and rad."""
+
+    symmetry: dict[str, Any]
+    """Fields of geometry.Symmetry."""
+    values: dict[str, float]
+    prior_sigma: dict[str, float]
+    posterior_sigma: dict[str, float]
+    constrained: dict[str, bool]
+    """By the data."""
+    better_direction: NotRequired[list[float]]
+    """About which a coarse field fits far better."""
+
+
+class HalfAsymmetry(TypedDict):
+    """The two halves of a view of an axisymmetric flow against each other."""
+
+    name: str
+    measured: str
+    cc: dict[str, float]
+    antisymmetry: float
+    """Antisymmetric fraction of the signal."""
+
+
+class Uncertainty(TypedDict):
+    """Bootstrap trials, or draws from the posterior."""
+
+    kind: str
+    trials: int
+    diverged_trials: list[int]
+    """Excluded ones."""
+    seconds: float
+    source: NotRequired[str]
+    """bootstrap, or posterior."""
+
+
+class DetailEntries(TypedDict):
+    """Detail added to the field of the method (reconstruction/detail/detail.py)."""
+
+    residual_before: float
+    """Rms over sigma, without and with it."""
+    residual_after: float
+    withheld_before: Score
+    """The same of the withheld view in the cross-validation: of rough trials on a coarse grid, and of pixels by which
+    nothing was chosen. NaN without one."""
+    withheld_after: Score
+    blurred: bool
+    """Whether it was added to the blurred field."""
+    voxels: int
+    """Along the longest edge of the box."""
+    iterations: int
+    seconds: float
+
+
+class VerdictEntries(TypedDict):
+    """See analysis.verdict.Verdict."""
+
+    rating: str
+    error: float | None
+    reasons: str
+    low: float | None
+    high: float | None
+
+
+class SliceScores(TypedDict):
+    """A slice across z against the truth."""
+
+    z_mm: float
+    cc: Score
+    ssim: Score
+    psnr: Score
+
+
+class Coverage(TypedDict):
+    """Fraction of the voxels whose truth lies within one and two standard deviations."""
+
+    one_sigma: Score
+    two_sigma: Score
+    one_sigma_in_flow: Score
+    two_sigma_in_flow: Score
+    reliability: NotRequired[list[float]]
+    """In the flow, within the bands of metrics.LEVELS."""
+    spearman: Score
+    """Rank correlation of |error| and standard deviation."""
+
+
+@with_config(ConfigDict(extra="forbid"))
+@dataclass(frozen=True, kw_only=True)
+class Metrics:
+    """Content of metrics.json; a section is None or empty where its step has not run."""
+
+    version: Literal[1] = 1
+
+    measurement: str | None = None
+    """File of the views, absolute path."""
+    seconds: float | None = None
+    """Of the main run."""
+    peak_memory_bytes: int | None = None
+    """Tensors on a GPU, the whole process on a CPU."""
+    device: str | None = None
+    outcome: str | None = None
+    """Why it ended: converged, ..."""
+    message: str | None = None
+    cross_validation: WithheldRun | None = None
+
+    detail: DetailEntries | None = None
+
+    views: list[ViewScores] = field(default_factory=list)
+    reprojection: list[PredictionAccuracy] = field(default_factory=list)
+
+    rig: list[RefinedView] = field(default_factory=list)
+    """Refined cameras."""
+    withheld_rig: list[RefinedView] = field(default_factory=list)
+    """Cameras of withheld views, refined against the field."""
+    withheld_views: list[ViewScores] = field(default_factory=list)
+    """Withheld views, predicted with these cameras."""
+
+    axis: AxisEstimate | None = None
+    asymmetry: list[HalfAsymmetry] = field(default_factory=list)
+
+    uncertainty: Uncertainty | None = None
+    verdict: VerdictEntries | None = None
+
+    truth: str | None = None
+    """File of the true field, absolute path."""
+    quantity: str | None = None
+    """Of the field that was compared with it."""
+    l2: Score | None = None
+    l2_variation: Score | None = None
+    cc: Score | None = None
+    ssim: Score | None = None
+    psnr: Score | None = None
+    slices: list[SliceScores] = field(default_factory=list)
+    aligned: dict[str, Any] | None = None
+    """The same after the best rigid motion, `rotation_rad` and `shift_mm`."""
+    coverage: Coverage | None = None
+
+    @classmethod
+    def of(cls, entries: Any) -> Metrics:
+        """Return the content of a file, checked."""
+        if not isinstance(entries, dict):
+            raise InputError("expected a table of names and values")
+        if entries.get("version") != VERSION:
+            raise InputError(
+                f"expected version {VERSION} of the metrics, got {entries.get('version', 'none')}; "
+                "remove it, and nerif evaluate writes the comparison with views and truth again",
+                field="version",
+            )
+        try:
+            return _adapter().validate_python(entries)
+        except ValidationError as error:
+            first = error.errors(include_url=False)[0]
+            place = ".".join(map(str, first["loc"]))
+            expected, got = first["msg"][0].lower() + first["msg"][1:], repr(first["input"])[:60]
+            raise InputError(f"{expected}, got {got}", field=place) from None
+
+    @classmethod
+    def read(cls, path: Path) -> Metrics:
+        """Read a file."""
+        entries = read_json(path)
+        try:
+            return cls.of(entries)
+        except InputError as error:
+            raise error.inside(path) from None
+
+    def write(self, path: Path) -> None:
+        """Write a file, without empty sections, atomically."""
+        write_json(path, {name: value for name, value in asdict(self).items() if value not in (None, [])})
+
+
+@cache
+def _adapter() -> TypeAdapter[Metrics]:
+    return TypeAdapter(Metrics)
