@@ -1,5 +1,5 @@
 # make demo   set up, simulate a small flame, reconstruct it, evaluate it: results in out/demo (two minutes)
-# make test   set up, run the tests, with lint, types and the order of the rooms beside them (make test-all: the long ones too)
+# make test   set up, run the tests, then lint, types and the order of the rooms (make test-all: the long ones too)
 # make app    set up, and work on out/demo (make demo) in the browser
 # make docs   the documentation site: open docs/_build/html/index.html
 # make dist   wheel and sdist in dist/, built and checked as the release workflow does
@@ -24,10 +24,10 @@ app: .venv/.app
 	$(BIN)/nerif app out/demo
 
 test: .venv/.dev
-	$(MAKE) --no-print-directory --keep-going --jobs 2 lint short-tests
+	$(MAKE) --no-print-directory --keep-going short-tests lint
 
 test-all: .venv/.dev
-	$(MAKE) --no-print-directory --keep-going --jobs 2 lint all-tests
+	$(MAKE) --no-print-directory --keep-going all-tests lint
 
 short-tests: .venv/.dev
 	$(PYTEST) -m "not slow"

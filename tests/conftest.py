@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 # ruff: noqa: E402
-import functools
-import inspect
 import itertools
 import math
 import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 # tests run side by side, each in a thread; threads that wait must not take the cores of other tests
 os.environ |= {"OMP_WAIT_POLICY": "PASSIVE", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
@@ -38,8 +35,6 @@ from nerif.fields.field import Field
 from nerif.fields.phantoms import GaussianBalls
 from nerif.geometry import Box, Camera, Ring
 from nerif.reconstruction.neural import schedule
-from nerif.reconstruction.neural.trainer import Trainer
-from nerif.reconstruction.voxels.voxel_reconstructor import VoxelReconstructor
 from nerif.simulation.simulate import simulate
 
 torch.set_num_threads(1)  # tests run side by side
@@ -73,36 +68,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         group[item] = shared[0] if shared else item.path.stem
         item.add_marker(pytest.mark.xdist_group(group[item]))
     items.sort(key=lambda item: LONGEST.index(group[item]) if group[item] in LONGEST else len(LONGEST))
-
-
-@pytest.fixture(scope="session", autouse=True)
-def checked_steps() -> Iterator[None]:
-    """Shapes are checked in the first step of a training or descent; the others are like it, and many."""
-
-    def checked_once(run: Callable[..., Any]) -> Callable[..., Any]:
-        asks = inspect.signature(run)
-
-        @functools.wraps(run)
-        def run_checked_once(*given: Any, **named: Any) -> Any:
-            before, call = jaxtyping.config.jaxtyping_disable, asks.bind(*given, **named)
-            on_step = call.arguments.get("on_step")
-
-            def told(step: Any) -> Any:
-                jaxtyping.config.update("jaxtyping_disable", True)
-                return None if on_step is None else on_step(step)
-
-            call.arguments["on_step"] = told
-            try:
-                return run(*call.args, **call.kwargs)
-            finally:
-                jaxtyping.config.update("jaxtyping_disable", before)
-
-        return run_checked_once
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Trainer, "run", checked_once(Trainer.run))
-        patch.setattr(VoxelReconstructor, "__call__", checked_once(VoxelReconstructor.__call__))
-        yield
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any
 
 from nerif.common.conventions import InputError, ambient_index
 from nerif.common.files import atomic
@@ -103,7 +103,7 @@ class VolumeSequence:
         quantities: Sequence[str],
         n_ambient: float,
         attributes: Mapping[str, Any] | None = None,
-    ) -> Self:
+    ) -> VolumeSequence:
         """Make an empty store in place of an earlier one.
 
         Parameters
