@@ -17,7 +17,7 @@ WITH_PARENT = 1  # PR_SET_PDEATHSIG of Linux
 
 def main() -> None:
     """Fork until nobody asks any more."""
-    import nerif.app.server
+    import nerif.app.server.server
     from nerif.cli.cli import main as nerif
 
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # whoever has ended is not waited for

@@ -18,8 +18,8 @@ from app.test_calibration import TARGET
 from app.test_live_view import watched
 from app.test_pages import visit
 from app.test_results import result
-from nerif.app.frame import Page
 from nerif.app.pages import PAGES
+from nerif.app.pages.frame import Page
 from nerif.data.cameras_file import CalibratedCamera, write_cameras
 from nerif.geometry import Ring
 from nerif.simulation.simulate import Simulation

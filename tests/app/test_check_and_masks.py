@@ -16,8 +16,8 @@ from app.test_pages import line, put
 from app.test_results import pick
 from bodies import ball
 from nerif.analysis.consistency_file import read_findings
-from nerif.app.jobs import Job, Jobs
-from nerif.app.mask_editor import Brush
+from nerif.app.project.jobs import CommandRun, Jobs
+from nerif.app.views.mask_editor import Brush
 from nerif.data.measurement import Measurement
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Ring
@@ -60,7 +60,7 @@ def written(path: Path, seconds: float = 60.0) -> Measurement:
     return Measurement.read(path)
 
 
-def ended(jobs: Jobs, seconds: float) -> Job:
+def ended(jobs: Jobs, seconds: float) -> CommandRun:
     """Wait for the end of the last run."""
     end = time.monotonic() + seconds
     while (job := jobs.all()[0]).state in ("queued", "running"):

@@ -16,13 +16,13 @@ import pytest
 from nicegui import Client, ui
 
 from app.serving import answering, end, free_port, outside, served
-from nerif.app.elements import card
-from nerif.app.jobs import Jobs
+from nerif.app.forms.elements import card
+from nerif.app.forms.sliders import RangeSlider
 from nerif.app.pages import PAGES
-from nerif.app.project import Project
-from nerif.app.server import _handler
-from nerif.app.sliders import RangeSlider
-from nerif.app.workspace import Workspace
+from nerif.app.project.folder import ProjectFolder
+from nerif.app.project.jobs import Jobs
+from nerif.app.project.workspace import Workspace
+from nerif.app.server.server import _handler
 from refusals import refused
 
 MODULES = ("numpy", "psutil", "torch", "types", "lazy_loader", "multiprocessing", "selectors", "nicegui", "zarr")
@@ -80,7 +80,7 @@ def test_a_folder_whose_links_lead_what_the_app_writes_elsewhere_is_refused(tmp_
     elsewhere.mkdir()
     (folder / link).symlink_to(elsewhere)
     with refused("path"):
-        Workspace(Project(folder))
+        Workspace(ProjectFolder(folder))
     assert not any(elsewhere.iterdir())
 
 
@@ -90,7 +90,7 @@ def test_settings_and_drafts_that_are_none_break_nothing(tmp_path, text):
     jobs.mkdir(parents=True)
     (tmp_path / ".nerif" / "drafts.json").write_text(text)
     (jobs / "settings.json").write_text(text.replace("design", "at_once").replace("1", '"many"'))
-    work = Workspace(Project(tmp_path))
+    work = Workspace(ProjectFolder(tmp_path))
     assert work.draft("design") == {}
     assert work.jobs.at_once == 1
 
@@ -99,7 +99,7 @@ def test_drafts_name_no_cluster(tmp_path):
     (tmp_path / ".nerif").mkdir()
     values = {"cluster": "tcp://10.0.0.1:8786", "voxels": 40}
     (tmp_path / ".nerif" / "drafts.json").write_text(json.dumps({"reconstruct": {"film_values": values}}))
-    assert Workspace(Project(tmp_path)).draft("reconstruct") == {"film_values": {"voxels": 40}}
+    assert Workspace(ProjectFolder(tmp_path)).draft("reconstruct") == {"film_values": {"voxels": 40}}
 
 
 @pytest.mark.parametrize("title", ["a :title=location.href \\", 'of "cam" & <b>', "plain"])
@@ -183,11 +183,11 @@ def test_pages_open_with_the_defaults_where_drafts_have_wrong_types(tmp_path, wr
 
 def test_drafts_are_dropped_once(tmp_path, monkeypatch):
     reloads = []
-    monkeypatch.setattr("nerif.app.server.ui.navigate.reload", lambda: reloads.append(1))
-    work = Workspace(Project(tmp_path))
+    monkeypatch.setattr("nerif.app.server.server.ui.navigate.reload", lambda: reloads.append(1))
+    work = Workspace(ProjectFolder(tmp_path))
     work.keep("design", {"views": 4})
     page = SimpleNamespace(build=lambda work: {}["no draft is the cause"])
-    monkeypatch.setattr("nerif.app.server.frame", lambda *arguments: nullcontext())
+    monkeypatch.setattr("nerif.app.server.server.frame", lambda *arguments: nullcontext())
     asyncio.run(_handler(work, page)())
     assert (work.draft("design"), reloads) == ({}, [1])
     with pytest.raises(KeyError):

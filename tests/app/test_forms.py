@@ -7,8 +7,8 @@ import dataclasses
 import pytest
 import tyro
 
-from nerif.app.form_view import _control_value, _record_value
-from nerif.app.forms import Form
+from nerif.app.forms.form import Form
+from nerif.app.forms.form_view import _control_value, _record_value
 from nerif.app.pages.reconstruct import form_of, prepare
 from nerif.cli.commands.design import Design
 from nerif.cli.commands.export import Export

@@ -13,17 +13,17 @@ from app.serving import Served, opened, served
 from app.test_accessibility import CUT, PHONE, RULES, axe, metrics, settled
 from app.test_check_and_masks import click, ended
 from app.test_results import result, tab
-from nerif.app import demo
-from nerif.app.forms import Form
-from nerif.app.guide import state
-from nerif.app.jobs import Jobs
-from nerif.app.page import Page
+from nerif.app.forms.form import Form
 from nerif.app.pages import PAGES
 from nerif.app.pages.check import VIEW_SETTINGS, findings_file
 from nerif.app.pages.displacement import BY_PAGE
+from nerif.app.pages.guide import state
+from nerif.app.pages.page import Page
 from nerif.app.pages.reconstruct import form_of
-from nerif.app.project import Project
-from nerif.app.workspace import Workspace
+from nerif.app.project import demo_project as demo
+from nerif.app.project.folder import ProjectFolder
+from nerif.app.project.jobs import Jobs
+from nerif.app.project.workspace import Workspace
 from nerif.cli.cli import main
 from nerif.cli.commands.check import Check
 from nerif.cli.commands.design import Design
@@ -112,7 +112,7 @@ def test_a_folder_that_holds_something_else_is_left_alone(tmp_path, renders, cap
 def test_the_default_folder_is_a_new_one(tmp_path, renders, monkeypatch):
     calls = []
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("nerif.app.server.serve", lambda folder, *_: calls.append(folder))
+    monkeypatch.setattr("nerif.app.server.server.serve", lambda folder, *_: calls.append(folder))
     assert main(["app", "--demo", "--no-browser"]) == 0
     assert main(["app", "--no-browser"]) == 0
     assert main(["app", "mine", "--demo", "--no-browser"]) == 0  # it need not exist
@@ -148,7 +148,7 @@ def test_values_of_the_hints_are_valid_in_their_forms():
 
 def test_states_follow_the_files(tmp_path):
     folder = marked(tmp_path / "demo")
-    work, pages = Workspace(Project(folder)), {page.name: page for page in PAGES}
+    work, pages = Workspace(ProjectFolder(folder)), {page.name: page for page in PAGES}
 
     def sentence(name: str) -> str:
         return state(work, pages[name], PAGES)[0]

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from app.serving import Served, opened
-from nerif.app.edits import Edits
-from nerif.app.image_files import ImageFiles
-from nerif.app.project import Project
+from nerif.app.project.folder import ProjectFolder
+from nerif.app.project.image_cache import ImageCache
+from nerif.app.views.edits import Edits
 from nerif.imaging.readers.crop import Crop
 from nerif.imaging.readers.views import find_views
 from report.browsing import errors, needs_browser, requests, text, wait_for
@@ -151,9 +151,9 @@ def test_a_crop_is_drawn_undone_typed_kept_and_written(browser, server, folder):
 
 
 def test_images_are_kept_until_their_files_change(folder, monkeypatch):
-    files = ImageFiles(Project(folder))
+    files = ImageCache(ProjectFolder(folder))
     view = next(v for v in find_views(folder / "run") if v.name == "cam1")
-    monkeypatch.setattr("nerif.app.image_files.LIMIT", 2)
+    monkeypatch.setattr("nerif.app.project.image_cache.LIMIT", 2)
     first = files.image(view, "flow", 0, 280, None)
     assert files.image(view, "flow", 0, 280, None) is first
     files.image(view, "flow", 1, 280, None)

@@ -14,9 +14,9 @@ import pytest
 
 from app.serving import Served, served
 from app.test_pages import line, put, visit
-from nerif.app.jobs import Jobs
 from nerif.app.pages import PAGES
-from nerif.app.workspace import READ_ONLY
+from nerif.app.project.jobs import Jobs
+from nerif.app.project.workspace import READ_ONLY
 from nerif.cli.cli import main
 from report.browsing import errors, needs_browser, text, wait_for
 

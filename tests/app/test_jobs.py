@@ -12,9 +12,9 @@ from pathlib import Path
 import psutil
 import pytest
 
-from nerif.app import runner
-from nerif.app.jobs import Job, Jobs
-from nerif.app.result_volumes import film_progress
+from nerif.app.project import runner
+from nerif.app.project.jobs import CommandRun, Jobs
+from nerif.app.views.result_volumes import film_progress
 from nerif.cli.cli import main
 from nerif.common.files import write_json
 from nerif.common.installation import command_line
@@ -24,7 +24,7 @@ from refusals import refused
 HELP = ("--version",)
 
 
-def until(jobs: Jobs, id: str, *states: str, seconds: float = 60.0) -> Job:
+def until(jobs: Jobs, id: str, *states: str, seconds: float = 60.0) -> CommandRun:
     """Let the queue go on until a run is in one of the states."""
     end = time.monotonic() + seconds
     while (job := jobs.get(id)).state not in states:
@@ -149,8 +149,8 @@ def test_what_is_asked_while_a_run_starts_is_heard(tmp_path):
 
 
 def test_a_run_outlives_the_server(tmp_path):
-    code = "import sys; from nerif.app.jobs import Jobs; from pathlib import Path; jobs = Jobs(Path(sys.argv[1]));"
-    code += "print(jobs.add(('--version',), 'x').id); jobs.advance()"
+    code = "import sys; from nerif.app.project.jobs import Jobs; from pathlib import Path; "
+    code += "jobs = Jobs(Path(sys.argv[1])); print(jobs.add(('--version',), 'x').id); jobs.advance()"
     done = subprocess.run([sys.executable, "-c", code, str(tmp_path)], capture_output=True, text=True, check=True)
     assert until(Jobs(tmp_path), done.stdout.strip(), "done").code == 0
 

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from app.serving import opened
-from nerif.app.jobs import Jobs
-from nerif.app.live_view import status_html
-from nerif.app.surfaces import caption_of
+from nerif.app.project.jobs import Jobs
+from nerif.app.views.live_view import status_html
+from nerif.app.views.surfaces import caption_of
 from nerif.common.files import write_json
 from nerif.results.directory import LIVE, LIVE_FIELD
-from nerif.results.live import read_look
+from nerif.results.live import read_snapshot
 from report.browsing import errors, needs_browser, requests, text, wait_for
 
 OUT = "results/a <b>"
@@ -66,13 +66,13 @@ def test_a_slow_run_is_shown_to_be_one():
 
 
 def test_a_surface_is_told_in_words(folder, tmp_path):
-    found = read_look(folder / OUT)
+    found = read_snapshot(folder / OUT)
     assert found is not None
     assert found.volume.grid.box.upper == UPPER
     said = caption_of(found)
     assert said.startswith("Isosurface of refractive index at -5e-05, x from -6 to 6, y from -6 to 6, z from -6 to 6")
     look(tmp_path, -50.0, 3.0)
-    nothing = read_look(tmp_path)
+    nothing = read_snapshot(tmp_path)
     assert nothing is not None
     assert caption_of(nothing).endswith("nowhere yet.")
 

@@ -12,7 +12,7 @@ import pytest
 from app.serving import Served, opened
 from nerif.cli.cli import main
 from nerif.geometry import Ring
-from nerif.results.live import read_live, read_look
+from nerif.results.live import read_live, read_snapshot
 from nerif.simulation.design import DesignSettings, expect
 from report.browsing import errors, needs_browser, requests, text, wait_for
 
@@ -122,7 +122,7 @@ def test_a_run_is_started_watched_and_stopped(browser, server, folder):
     assert "measured" in said[0]
     assert "predicted" in said[1]
     out = folder / "results" / "m & <b>-nerif"
-    look, live = read_look(out), read_live(out)
+    look, live = read_snapshot(out), read_live(out)
     assert look is not None
     assert look.view == live["view"]
     assert np.isfinite(look.predicted).all()

@@ -7,8 +7,8 @@ from contextlib import chdir
 
 import pytest
 
-from nerif.app.project import Project
-from nerif.app.workspace import Workspace
+from nerif.app.project.folder import ProjectFolder
+from nerif.app.project.workspace import Workspace
 from nerif.cli.cli import main
 from refusals import refused
 
@@ -23,7 +23,7 @@ def folder(tmp_path):
 
 @pytest.mark.parametrize("name", ["../secret", "/etc/passwd", "a/../../secret", "", "x\0y"])
 def test_paths_outside_are_refused(folder, name):
-    project = Project(folder)
+    project = ProjectFolder(folder)
     if name:
         with refused("path"):
             project.path(name)
@@ -34,7 +34,7 @@ def test_paths_outside_are_refused(folder, name):
 def test_links_that_lead_outside_are_refused(folder):
     (folder / "out").symlink_to(folder.parent)
     (folder / "in").symlink_to(folder)
-    project = Project(folder)
+    project = ProjectFolder(folder)
     with refused("path"):
         project.path("out/secret")
     assert project.path("in/new.nc") == folder / "new.nc"
@@ -46,7 +46,7 @@ def test_no_name_in_a_folder_is_an_option(folder, capsys):
     (folder / "--out=.." / "run.toml").write_text("")
     (folder / "--config=x.nc").write_bytes(b"CDF no")
     (folder / "-ox.toml").write_text('format = "nerif-calibration-1"\n')
-    project = Project(folder)
+    project = ProjectFolder(folder)
     contents = project.contents()
     assert contents.measurements == ("./--config=x.nc",)
     assert contents.calibrations == ("./-ox.toml",)
@@ -71,7 +71,7 @@ def test_what_is_in_a_folder(folder):
         (folder / "images" / "cam1" / source).mkdir(parents=True)
     (folder / "away").symlink_to(folder.parent)
     (folder / "away.nc").symlink_to(folder.parent / "secret")
-    project = Project(folder)
+    project = ProjectFolder(folder)
     found = project.contents()
     assert found.measurements == ("<b>&.nc", "broken.nc")
     assert found.volumes == ("<b>&.truth.nc",)
@@ -86,12 +86,12 @@ def test_what_cannot_be_read_is_named(folder):
     if os.geteuid() == 0:
         pytest.skip("root may read everything")
     (folder / "closed").mkdir(mode=0)
-    assert Project(folder).contents().unread[0][0] == "closed"
+    assert ProjectFolder(folder).contents().unread[0][0] == "closed"
 
 
 def test_what_is_kept_of_files_is_bounded(folder, monkeypatch):
-    monkeypatch.setattr("nerif.app.project.LIMIT", 3)
-    project = Project(folder)
+    monkeypatch.setattr("nerif.app.project.folder.LIMIT", 3)
+    project = ProjectFolder(folder)
     for i in range(5):
         (folder / str(i)).touch()
         for what in ("measurement", "kind"):
@@ -103,18 +103,18 @@ def test_what_is_kept_of_files_is_bounded(folder, monkeypatch):
 
 
 def test_two_servers_keep_the_drafts_of_each_other(folder):
-    first, second = Workspace(Project(folder)), Workspace(Project(folder))
+    first, second = Workspace(ProjectFolder(folder)), Workspace(ProjectFolder(folder))
     for work in (first, second):
         assert work.draft("design") == {}
     first.keep("design", {"views": 5})
     second.keep("check", {"view": "a"})
-    third = Workspace(Project(folder))
+    third = Workspace(ProjectFolder(folder))
     assert (third.draft("design"), third.draft("check")) == ({"views": 5}, {"view": "a"})
     assert [path.name for path in (folder / ".nerif").iterdir()] == ["drafts.json"]
 
 
 def test_what_is_kept_of_a_file_is_as_new_as_the_file(folder):
-    project, path = Project(folder), folder / "a"
+    project, path = ProjectFolder(folder), folder / "a"
     path.write_text("1")
     calls = []
 
@@ -130,5 +130,5 @@ def test_what_is_kept_of_a_file_is_as_new_as_the_file(folder):
 
 def test_names_that_are_free(folder):
     (folder / "x").mkdir()
-    assert Project(folder).free_name("x") == "x-2"
-    assert Project(folder).free_name("y.nc") == "y.nc"
+    assert ProjectFolder(folder).free_name("x") == "x-2"
+    assert ProjectFolder(folder).free_name("y.nc") == "y.nc"

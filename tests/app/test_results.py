@@ -14,11 +14,11 @@ import torch
 
 from app.serving import Served, opened, served
 from app.test_pages import line
-from nerif.app.jobs import Jobs
-from nerif.app.project import Project
-from nerif.app.result_table import rows_of
-from nerif.app.result_view import ResultView
-from nerif.app.result_volumes import Film, Still
+from nerif.app.project.folder import ProjectFolder
+from nerif.app.project.jobs import Jobs
+from nerif.app.views.result_table import rows_of
+from nerif.app.views.result_view import ResultView
+from nerif.app.views.result_volumes import FilmVolumes, ResultVolumes
 from nerif.data.exports import export
 from nerif.data.velocity_sequence import VelocitySequence
 from nerif.data.volume import Volume
@@ -74,7 +74,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_what_is_listed_and_what_is_said_of_it(folder):
-    project = Project(folder)
+    project = ProjectFolder(folder)
     first, second, film = rows_of(project, project.contents())
     assert (first.name, second.name, film.name) == ("results/a <b>", "results/other", "film.zarr")
     assert first.cells[:5] == ("Tikhonov", "use", "1.9% of the variation", "0.01 px", "converged")
@@ -85,12 +85,12 @@ def test_what_is_listed_and_what_is_said_of_it(folder):
     assert (row.name, row.word, row.cells[4]) == ("results/z", "", "not ended")
     assert "has not ended" in row.sentence
     with refused("z"):
-        Still(unfinished).volume("index_excess")
+        ResultVolumes(unfinished).volume("index_excess")
     shutil.rmtree(unfinished)
 
 
 def test_sources_follow_the_files(folder, tmp_path):
-    still, film = Still(folder / "results" / "other"), Film(folder / "film.zarr")
+    still, film = ResultVolumes(folder / "results" / "other"), FilmVolumes(folder / "film.zarr")
     assert still.quantities == ("index_excess", "index_excess_std")
     assert film.frames == [0, 1, 2]
     assert film.limits("index_excess")[0] == pytest.approx(float(film.volume("index_excess", 0).values.min()), rel=0.1)
@@ -99,10 +99,10 @@ def test_sources_follow_the_files(folder, tmp_path):
     copy = tmp_path / "r"
     copy.mkdir()
     export(copy / "volume.nc", [still.volume("index_excess")])
-    before = Still(copy).limits("index_excess")
+    before = ResultVolumes(copy).limits("index_excess")
     twice = still.volume("index_excess")
     export(copy / "volume.nc", [Volume.of(2 * twice.values, twice.grid, "index_excess", AMBIENT)], force=True)
-    assert Still(copy).limits("index_excess")[0] == pytest.approx(2 * before[0])
+    assert ResultVolumes(copy).limits("index_excess")[0] == pytest.approx(2 * before[0])
 
 
 def test_a_velocity_is_a_film_of_speeds(tmp_path):
@@ -113,14 +113,14 @@ def test_a_velocity_is_a_film_of_speeds(tmp_path):
         w = (i + 1) * torch.exp(-(x**2 + y**2) / 100).masked_fill(z < z.median(), math.nan)
         zero = torch.zeros_like(w)
         store.write_frame(i, {"u": zero, "v": zero, "w": w, "pressure": zero, "u_std": zero + 0.1})
-    film = Film(tmp_path / "v.zarr")
+    film = FilmVolumes(tmp_path / "v.zarr")
     assert film.quantities[:4] == ("speed", "vorticity", "u", "u_std")
     low, high = film.limits("speed")
     assert low == pytest.approx(0, abs=0.1)
     assert high == pytest.approx(2, rel=0.2)
     assert math.isfinite(film.level("speed"))
     assert film.volume("vorticity", 1).unit == "s-1"
-    project = Project(tmp_path)
+    project = ProjectFolder(tmp_path)
     (row,) = rows_of(project, project.contents())
     assert row.cells[0] == "velocity, 2 frames"
 
@@ -131,8 +131,8 @@ def test_films_are_compared_at_the_same_instants(tmp_path):
         store = VolumeSequence.create(tmp_path / f"{name}.zarr", times, grid, ("index_excess",), AMBIENT)
         for i, time in enumerate(times):
             store.write(i, [Volume(torch.full(grid.shape, time), grid)])
-    look = ResultView(SimpleNamespace(project=Project(tmp_path)), "a.zarr", ["b.zarr"], {}, lambda: None)
-    look.source = Film(tmp_path / "a.zarr")
+    look = ResultView(SimpleNamespace(project=ProjectFolder(tmp_path)), "a.zarr", ["b.zarr"], {}, lambda: None)
+    look.source = FilmVolumes(tmp_path / "a.zarr")
     for step, time in ((1, 1e-3), (2, 2.4e-3)):
         panels, note = look._panels("index_excess", "b.zarr", step)
         assert [float(panel.volume.values.mean()) for panel in panels[:2]] == pytest.approx([step * 1e-3, time])

@@ -18,9 +18,9 @@ import pytest
 
 from app.serving import Served, answering, free_port, outside, served
 from nerif.app.command import App
-from nerif.app.guard import cookie_of
-from nerif.app.private import page_leading_to
-from nerif.app.server import Address, is_relevant
+from nerif.app.server.guard import cookie_of
+from nerif.app.server.private import page_leading_to
+from nerif.app.server.server import Address, is_relevant
 from nerif.cli.cli import main
 from nerif.cli.commands.settings import read_settings
 from nerif.common.conventions import InputError

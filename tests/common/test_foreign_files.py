@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from bodies import cuboid
-from nerif.app.project import Contents, Project
+from nerif.app.project.folder import Contents, ProjectFolder
 from nerif.cli.arguments import INPUTS, check_arguments
 from nerif.cli.cli import main
 from nerif.common.conventions import InputError
@@ -80,7 +80,7 @@ def test_every_command_says_that_its_input_is_a_pipe(tmp_path, command):
 def test_a_project_ignores_pipes(tmp_path):
     for name in ("a.toml", "a.nc", "a.vti"):
         os.mkfifo(tmp_path / name)
-    assert Project(tmp_path).contents() == Contents()
+    assert ProjectFolder(tmp_path).contents() == Contents()
 
 
 SEQUENCES = {"escape": "cam\x1b[31m1", "C1": "cam\x9b31m", "line": "cam\n1", "bidi": "cam\u202e1", "NUL": "a\0b"}

@@ -69,11 +69,11 @@ def test_the_project_of_the_app(folder, expected, tmp_path, monkeypatch):
     if "project" not in expected:
         pytest.skip("written before the app had one")
     pytest.importorskip("nicegui")
-    from nerif.app.project import OWN, Project
-    from nerif.app.workspace import Workspace
+    from nerif.app.project.folder import OWN, ProjectFolder
+    from nerif.app.project.workspace import Workspace
 
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
-    workspace = Workspace(Project(folder / "project"))
+    workspace = Workspace(ProjectFolder(folder / "project"))
     assert workspace.draft("design") == expected["project"]["design"]
     assert workspace.jobs.at_once == expected["project"]["at_once"]
     (job,) = workspace.jobs.all()

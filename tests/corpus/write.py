@@ -16,8 +16,8 @@ from typing import Any
 import torch
 
 import nerif
-from nerif.app.project import OWN, Project
-from nerif.app.workspace import Workspace
+from nerif.app.project.folder import OWN, ProjectFolder
+from nerif.app.project.workspace import Workspace
 from nerif.cli.cli import main
 from nerif.data.cameras_file import CalibratedCamera, write_cameras
 from nerif.fields.network import NetworkShape
@@ -68,7 +68,7 @@ def write(folder: Path) -> None:
 def write_project(folder: Path, measurement: Path) -> None:
     """Write what nerif app keeps in the folder of a project: drafts of the pages, runs, findings of a check."""
     folder.mkdir()
-    workspace = Workspace(Project(folder))
+    workspace = Workspace(ProjectFolder(folder))
     workspace.keep("design", PROJECT["design"])
     workspace.jobs.at_once = PROJECT["at_once"]
     workspace.jobs.add(PROJECT["run"], "a run", "results/r")

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from nerif.app.project import Project
+from nerif.app.project.folder import ProjectFolder
 from nerif.cli.cli import main
 from nerif.results.directory import ResultDirectory
 from nerif.results.metrics_file import Metrics
@@ -25,7 +25,7 @@ def test_links_that_lead_out_of_a_result_are_refused(tmp_path, name):
     (outside / "x").write_text("")
     with refused(result / name):
         ResultDirectory(result)
-    contents = Project(tmp_path / "project").contents()
+    contents = ProjectFolder(tmp_path / "project").contents()
     assert contents.results == ()
     assert [path for path, _ in contents.unread] == ["result"]
     assert main(["figures", str(result)]) == 2

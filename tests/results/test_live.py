@@ -16,7 +16,7 @@ from nerif.reconstruction.progress import QUIET
 from nerif.reconstruction.reconstructor import Step
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.results import live
-from nerif.results.live import Live, read_live, read_look
+from nerif.results.live import Live, read_live, read_snapshot
 from nerif.simulation.simulate import Simulation
 from nerif.workflow.job import Run
 from nerif.workflow.pipeline import reconstruct_into
@@ -37,7 +37,7 @@ def test_the_status_of_a_run(measurement, method, withhold, tmp_path, monkeypatc
         monkeypatch.setattr(live, name, value)
     run = Run(withhold=withhold, report=False)
     result = reconstruct_into(tmp_path / "r", measurement, method, run, voxels=8, live=True)
-    status, look = read_live(tmp_path / "r"), read_look(tmp_path / "r")
+    status, look = read_live(tmp_path / "r"), read_snapshot(tmp_path / "r")
     assert status["progress"] == 1 or isinstance(method, Tikhonov)  # which may converge before
     assert status["step"] >= status["curve"]["step"][-1]
     assert len(status["curve"]["seconds"]) == len(status["curve"]["step"]) > 1
@@ -63,7 +63,7 @@ def test_the_view_is_seen_by_the_camera_that_is_refined(measurement, tmp_path, m
     for data, table in ((measurement, []), (knocked, rig)):
         with Live(tmp_path, data, NeRIF()).watching(QUIET, withheld=False).training("training") as on_step:
             on_step(replace(step, rig=lambda table=table: table))
-        looks.append(read_look(tmp_path).predicted)
+        looks.append(read_snapshot(tmp_path).predicted)
     np.testing.assert_allclose(*looks, atol=1e-4 * np.nanmax(np.abs(looks[0])))
 
 
@@ -85,7 +85,7 @@ def test_a_status_that_cannot_be_written_does_not_end_a_run(measurement, tmp_pat
 def test_no_status_unless_requested(measurement, tmp_path):
     reconstruct_into(tmp_path, measurement, Tikhonov(voxels=8), Run(report=False, withhold=("none",)), force=True)
     assert read_live(tmp_path) == {}
-    assert read_look(tmp_path) is None
+    assert read_snapshot(tmp_path) is None
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from typing import Annotated
 
 import tyro
 
-from nerif.app.guard import ADDRESS
+from nerif.app.server.guard import ADDRESS
 from nerif.cli.commands.settings import Settings, read_settings
 from nerif.common.conventions import InputError
 from nerif.common.installation import install
@@ -70,14 +70,14 @@ def run(settings: App) -> None:
     """Start the server; Ctrl-C ends it."""
     if importlib.util.find_spec("nicegui") is None:
         raise InputError(f"expected NiceGUI, which is not installed; {install('app')}", field="app")
-    from nerif.app.server import Address, serve
+    from nerif.app.server.server import Address, serve
 
     address = Address.of(
         settings.host, settings.port, settings.token, settings.allowed_host, settings.root_path.rstrip("/")
     )
     folder = settings.folder or Path(".")
     if settings.demo:
-        from nerif.app.demo import FOLDER, fill
+        from nerif.app.project.demo_project import FOLDER, fill
 
         folder = settings.folder or FOLDER
         fill(folder)

@@ -37,7 +37,7 @@ from nerif.reconstruction.rig_parameters import with_corrections
 from nerif.reconstruction.uncertainty.bootstrap import best_covered
 from nerif.results.directory import LIVE, LIVE_FIELD
 
-__all__ = ["Live", "Look", "read_live", "read_look"]
+__all__ = ["Live", "LiveSnapshot", "read_live", "read_snapshot"]
 
 STATUS_INTERVAL = 1.0  # s, of live.json
 FIELD_DELAY = 1.0  # s, before the first live.npz
@@ -50,7 +50,7 @@ CURVE_POINTS = 400  # at most; then every second is dropped
 
 
 @dataclass(frozen=True)
-class Look:
+class LiveSnapshot:
     """The field during a run, and one of its views.
 
     Parameters
@@ -126,7 +126,7 @@ class Live:
             if newest:  # the last step
                 self._attempt(self._write, title, newest[0])
                 if looks:
-                    self._attempt(self._look, title, newest[0], withheld)
+                    self._attempt(self._write_snapshot, title, newest[0], withheld)
 
         return replace(monitor, training=training)
 
@@ -146,7 +146,7 @@ class Live:
                 self._attempt(self._write, title, step)
                 status = now + STATUS_INTERVAL
             if looks and now >= field:
-                self._attempt(self._look, title, step, withheld)
+                self._attempt(self._write_snapshot, title, step, withheld)
                 end = time.monotonic()
                 field, is_first = end + _pause(end - now, is_first), False
 
@@ -177,7 +177,7 @@ class Live:
             write_json(path, {**entries, "curve": curve})
 
     @torch.no_grad()
-    def _look(self, title: str, step: Step, withheld: bool) -> None:
+    def _write_snapshot(self, title: str, step: Step, withheld: bool) -> None:
         m, field = with_corrections(self.measurement, step.rig()), step.field()
         grid = Grid.of_resolution(m.box, COARSE_VOXELS)
         volume = sampled(field, grid, m.quantity, m.n_ambient, m.bodies, str(_device(field)))
@@ -238,7 +238,7 @@ def read_live(directory: Path) -> dict[str, Any]:
     return read_json(path) if path.is_file() else {}
 
 
-def read_look(directory: Path) -> Look | None:
+def read_snapshot(directory: Path) -> LiveSnapshot | None:
     """Return the content of live.npz of a result directory; None if there is none."""
     path = directory / LIVE_FIELD
     if not path.is_file():
@@ -249,4 +249,4 @@ def read_look(directory: Path) -> Look | None:
         for name in ("lower", "upper", "components"):
             about[name] = tuple(about[name])
         arrays = {name: file.get(name, empty) for name in ("measured", "predicted")}
-        return Look(**about, values=file["values"], **arrays)
+        return LiveSnapshot(**about, values=file["values"], **arrays)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from nerif.app.page import Page
 from nerif.app.pages import calibration, check, design, displacement, images, reconstruct, results
+from nerif.app.pages.page import Page
 
 __all__ = ["PAGES"]
 

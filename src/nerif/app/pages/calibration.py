@@ -8,16 +8,16 @@ from typing import Any
 import tyro
 from nicegui import ui
 
-from nerif.app.elements import CommandLine, card, refusals, select, text_html
-from nerif.app.form_view import FormView
-from nerif.app.forms import Form
-from nerif.app.job_form import JobStatus
-from nerif.app.jobs import Job
-from nerif.app.page import Hint, Page
-from nerif.app.project import Contents
-from nerif.app.rig_scene import read_rig, show_rig
-from nerif.app.target_images import TargetImages
-from nerif.app.workspace import Workspace
+from nerif.app.forms.elements import CommandLine, card, refusals, select, text_html
+from nerif.app.forms.form import Form
+from nerif.app.forms.form_view import FormView
+from nerif.app.forms.job_form import JobStatus
+from nerif.app.pages.page import Hint, Page
+from nerif.app.project.folder import Contents
+from nerif.app.project.jobs import CommandRun
+from nerif.app.project.workspace import Workspace
+from nerif.app.views.calibration_images import CalibrationImages
+from nerif.app.views.rig_scene import read_rig, show_rig
 from nerif.cli.commands.calibrate import Calibrate
 from nerif.cli.commands.settings import merge
 from nerif.common.conventions import InputError
@@ -87,7 +87,7 @@ class CalibrationPage:
                 with card("Images of the target", "Circles: detected points, the first one filled. "
                           "Left-out images are part of the command line; calibrate again after it."):  # fmt: skip
                     self.view = select("View", []).classes("short")
-                    self.images = TargetImages(work, self._toggle)
+                    self.images = CalibrationImages(work, self._toggle)
 
     # -- the form ------------------------------------------------------------------------------------------------
 
@@ -192,7 +192,7 @@ class CalibrationPage:
             self.work.project.path(self.out.value).parent.mkdir(parents=True, exist_ok=True)
             self.status.follow(self.work.jobs.add(self.arguments(), f"Calibrate {self.experiment.value}"))
 
-    async def _on_end(self, job: Job) -> None:
+    async def _on_end(self, job: CommandRun) -> None:
         """Show what the run wrote."""
         if job.state == "done":
             self.contents = await self.work.contents()

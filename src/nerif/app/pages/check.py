@@ -10,13 +10,13 @@ from nicegui import ui
 from PIL import Image
 
 from nerif.analysis.consistency_file import CheckFindings, read_findings
-from nerif.app.elements import CommandLine, FileChoice, card, items_html, refusals, table_html, text_html
-from nerif.app.forms import Form
-from nerif.app.job_form import JobForm, JobStatus
-from nerif.app.jobs import Job
-from nerif.app.page import Hint, Page
-from nerif.app.project import OWN
-from nerif.app.workspace import Workspace
+from nerif.app.forms.elements import CommandLine, FileChoice, card, items_html, refusals, table_html, text_html
+from nerif.app.forms.form import Form
+from nerif.app.forms.job_form import JobForm, JobStatus
+from nerif.app.pages.page import Hint, Page
+from nerif.app.project.folder import OWN
+from nerif.app.project.jobs import CommandRun
+from nerif.app.project.workspace import Workspace
 from nerif.cli.commands.body import BodyInFlow
 from nerif.cli.commands.check import Check
 
@@ -106,7 +106,7 @@ class CheckPage:
         assert self.body is not None
         self.body.show()
 
-    async def _on_body(self, job: Job) -> None:
+    async def _on_body(self, job: CommandRun) -> None:
         self._show_outlines()
 
     def _show_outlines(self) -> None:
@@ -137,7 +137,7 @@ class CheckPage:
         self._show_outlines()
         self.show()
 
-    async def _on_end(self, job: Job) -> None:
+    async def _on_end(self, job: CommandRun) -> None:
         """Show what the run has written."""
         if job.state == "done":
             self.show()

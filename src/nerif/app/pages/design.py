@@ -9,12 +9,12 @@ from html import escape
 import torch
 from nicegui import ui
 
-from nerif.app.demo import RIG
-from nerif.app.elements import CommandLine, card, figures, items_html
-from nerif.app.form_view import FormView
-from nerif.app.forms import Form
-from nerif.app.page import Hint, Page
-from nerif.app.workspace import Workspace
+from nerif.app.forms.elements import CommandLine, card, figures, items_html
+from nerif.app.forms.form import Form
+from nerif.app.forms.form_view import FormView
+from nerif.app.pages.page import Hint, Page
+from nerif.app.project.demo_project import RIG
+from nerif.app.project.workspace import Workspace
 from nerif.cli.commands.design import Design
 from nerif.geometry import Camera
 from nerif.simulation.design import Expectation, expect

@@ -8,15 +8,15 @@ from pathlib import Path
 
 from nicegui import ui
 
-from nerif.app.demo import EDGE
-from nerif.app.elements import FileChoice, card, refusals, select, text_html, work_in_progress
-from nerif.app.forms import Form
-from nerif.app.job_form import JobForm
-from nerif.app.mask_editor import MaskCard
-from nerif.app.page import Hint, Page
-from nerif.app.project import Contents
-from nerif.app.view_maps import maps_html
-from nerif.app.workspace import Workspace
+from nerif.app.forms.elements import FileChoice, card, refusals, select, text_html, work_in_progress
+from nerif.app.forms.form import Form
+from nerif.app.forms.job_form import JobForm
+from nerif.app.pages.page import Hint, Page
+from nerif.app.project.demo_project import EDGE
+from nerif.app.project.folder import Contents
+from nerif.app.project.workspace import Workspace
+from nerif.app.views.mask_editor import MaskCard
+from nerif.app.views.view_maps import maps_html
 from nerif.cli.commands.displacement import Displacement
 from nerif.common.installation import word_of
 from nerif.data.measurement import Measurement

@@ -8,10 +8,10 @@ from typing import Any
 
 from nicegui import ui
 
-from nerif.app.crop_editor import SOURCES, CropCard
-from nerif.app.elements import CommandLine, card, items_html, refusals, select, text_html
-from nerif.app.page import Hint, Page
-from nerif.app.workspace import Workspace
+from nerif.app.forms.elements import CommandLine, card, items_html, refusals, select, text_html
+from nerif.app.pages.page import Hint, Page
+from nerif.app.project.workspace import Workspace
+from nerif.app.views.crop_editor import SOURCES, CropCard
 from nerif.common.conventions import InputError
 from nerif.imaging.quality.image_quality import ImageQuality
 from nerif.imaging.readers.views import View

@@ -11,12 +11,12 @@ from typing import Any
 import tyro
 from nicegui import ui
 
-from nerif.app.elements import CommandLine, FileChoice, card, refusals, select, text_html
-from nerif.app.form_view import FormView
-from nerif.app.forms import Form
-from nerif.app.live_view import LiveView
-from nerif.app.page import Hint, Page
-from nerif.app.workspace import Workspace
+from nerif.app.forms.elements import CommandLine, FileChoice, card, refusals, select, text_html
+from nerif.app.forms.form import Form
+from nerif.app.forms.form_view import FormView
+from nerif.app.pages.page import Hint, Page
+from nerif.app.project.workspace import Workspace
+from nerif.app.views.live_view import LiveView
 from nerif.cli.commands.reconstruct import Reconstruct, command_of
 from nerif.cli.commands.sequence import Sequence
 from nerif.common.conventions import InputError

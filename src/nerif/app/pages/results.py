@@ -9,15 +9,15 @@ from typing import Any
 import tyro
 from nicegui import ui
 
-from nerif.app.elements import CommandLine, card, figures, refusals, select, text_html
-from nerif.app.forms import Form
-from nerif.app.job_form import JobForm, JobStatus
-from nerif.app.jobs import Job
-from nerif.app.page import Hint, Page
-from nerif.app.result_table import Row, result_table, rows_of
-from nerif.app.result_view import ResultView
-from nerif.app.routes import report_address, report_file
-from nerif.app.workspace import Workspace
+from nerif.app.forms.elements import CommandLine, card, figures, refusals, select, text_html
+from nerif.app.forms.form import Form
+from nerif.app.forms.job_form import JobForm, JobStatus
+from nerif.app.pages.page import Hint, Page
+from nerif.app.project.jobs import CommandRun
+from nerif.app.project.workspace import Workspace
+from nerif.app.views.result_table import Row, result_table, rows_of
+from nerif.app.views.result_view import ResultView
+from nerif.app.views.routes import report_address, report_file
 from nerif.cli.commands.export import Export
 from nerif.cli.commands.figures import Figures
 from nerif.cli.commands.movie import MovieCommand
@@ -132,7 +132,7 @@ class ResultsPage:
             with refusals():
                 status.follow(self.work.jobs.add(["report", name], f"Report {self.row.title}"))
 
-        async def on_end(job: Job) -> None:
+        async def on_end(job: CommandRun) -> None:
             if job.state == "done":
                 await self.build()
 

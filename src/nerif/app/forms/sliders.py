@@ -10,7 +10,7 @@ from typing import Any
 
 from nicegui import ui
 
-__all__ = ["RangeSlider", "Scale"]
+__all__ = ["RangeSlider", "SliderScale"]
 
 STEPS = 400
 DECADES = 1.3  # from this range on a scale is logarithmic
@@ -63,7 +63,7 @@ class RangeSlider:
 
 
 @dataclass(frozen=True)
-class Scale:
+class SliderScale:
     """Steps 0 to `last` of a slider between two values, logarithmic if these span decades.
 
     Parameters

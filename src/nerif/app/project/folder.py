@@ -18,7 +18,7 @@ from nerif.data.kinds import VOLUME, kind_of
 from nerif.imaging.readers.views import View, find_views
 from nerif.results.directory import LIVE, RUN, check_links
 
-__all__ = ["OWN", "Contents", "Project"]
+__all__ = ["OWN", "Contents", "ProjectFolder"]
 
 DEPTH = 3  # levels of folders that are searched
 LIMIT = 20_000  # entries that are searched
@@ -54,7 +54,7 @@ class Contents:
     unread: tuple[tuple[str, str], ...] = ()
 
 
-class Project:
+class ProjectFolder:
     """A folder; everything is read and written below it."""
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:

@@ -18,7 +18,7 @@ from nerif.report.movie import finished_frames, ranges_over_time
 from nerif.report.packing import coarsen
 from nerif.results.directory import VOLUME
 
-__all__ = ["Film", "Source", "Still", "film_progress", "source_of"]
+__all__ = ["FilmVolumes", "ResultVolumes", "Source", "film_progress", "source_of"]
 
 Limits = tuple[float, float]
 
@@ -37,7 +37,7 @@ class Source(Protocol):
     def level(self, quantity: str) -> float: ...
 
 
-class Still:
+class ResultVolumes:
     """A result directory."""
 
     def __init__(self, path: Path) -> None:
@@ -72,7 +72,7 @@ class Still:
         return default_level(self.volume(quantity))
 
 
-class Film:
+class FilmVolumes:
     """A Zarr store of volumes over time, with at least one complete frame."""
 
     def __init__(self, path: Path) -> None:
@@ -102,7 +102,7 @@ class Film:
 
 def source_of(path: Path) -> Source:
     """Open a result directory or a store over time."""
-    return Film(path) if ending(path) == ".zarr" else Still(path)
+    return FilmVolumes(path) if ending(path) == ".zarr" else ResultVolumes(path)
 
 
 def film_progress(path: Path) -> tuple[float, str]:

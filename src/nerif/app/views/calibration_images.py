@@ -7,21 +7,21 @@ from html import escape
 
 from nicegui import ui
 
-from nerif.app.elements import text_html
-from nerif.app.workspace import Workspace
+from nerif.app.forms.elements import text_html
+from nerif.app.project.workspace import Workspace
 from nerif.common.conventions import InputError
 from nerif.imaging.calibration.result import ImageError
 from nerif.imaging.calibration.target_images import few_detections, pose_names
 from nerif.imaging.calibration.targets import CalibrationTarget, Detection
 from nerif.imaging.readers.views import View
 
-__all__ = ["TargetImages"]
+__all__ = ["CalibrationImages"]
 
 SOURCES = {"target": "In space", "background": "On the background"}
 LARGEST = 420  # px
 
 
-class TargetImages:
+class CalibrationImages:
     """The target images of one view.
 
     Parameters

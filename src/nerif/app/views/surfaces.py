@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 from nicegui import ui
 
-from nerif.app.routes import bodies_address, live_address, surface_address
-from nerif.app.sliders import RangeSlider
+from nerif.app.forms.sliders import RangeSlider
+from nerif.app.views.routes import bodies_address, live_address, surface_address
 from nerif.common.conventions import unit_shown
 from nerif.data.volume import describe, name_of
 from nerif.geometry import Box
 from nerif.report.isosurface import default_level, surface_triangles
-from nerif.results.live import Look
+from nerif.results.live import LiveSnapshot
 
 __all__ = ["LiveSurface", "Surface", "SurfaceView", "caption_of", "scene_of"]
 
@@ -178,12 +178,12 @@ class LiveSurface:
         self._scene, self._surfaces = None, []
 
     def show(self, name: str, stamp: int, box: Box, caption: str) -> None:
-        """Show the surface of a look.
+        """Show the surface of a snapshot.
 
         Parameters
         ----------
         name : result directory, relative to the project
-        stamp : number that changes with each look
+        stamp : number that changes with each snapshot
         box : mm
         caption : description of the surface
         """
@@ -199,15 +199,15 @@ class LiveSurface:
         self._caption.set_content(f"<figcaption>{escape(caption)}</figcaption>")
 
 
-def caption_of(look: Look) -> str:
-    """Return the level and extent of the isosurface of a look as text."""
-    volume = look.volume
+def caption_of(snapshot: LiveSnapshot) -> str:
+    """Return the level and extent of the isosurface of a snapshot as text."""
+    volume = snapshot.volume
     level = default_level(volume)
     corners = surface_triangles(volume, level).reshape(-1, 3)
-    unit = unit_shown(describe(look.quantity)[0])
-    head = f"Isosurface of {name_of(look.quantity)} at {level:.2g} {unit}".rstrip()
+    unit = unit_shown(describe(snapshot.quantity)[0])
+    head = f"Isosurface of {name_of(snapshot.quantity)} at {level:.2g} {unit}".rstrip()
     if not len(corners):
         return f"{head}: nowhere yet."
     ends = zip("xyz", np.min(corners, axis=0), np.max(corners, axis=0), strict=True)
     spans = ", ".join(f"{axis} from {low:.0f} to {high:.0f}" for axis, low, high in ends)
-    return f"{head}, {spans} mm, after {look.seconds:.0f} s."
+    return f"{head}, {spans} mm, after {snapshot.seconds:.0f} s."

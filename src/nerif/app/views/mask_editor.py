@@ -11,13 +11,13 @@ from typing import Any
 
 from nicegui import ui
 
-from nerif.app.edits import Edits, UndoButtons
-from nerif.app.elements import dialog, refusals, select, text_html
-from nerif.app.forms import Form
-from nerif.app.job_form import JobForm
-from nerif.app.project import OWN
-from nerif.app.view_maps import magnitude_address, threshold_address
-from nerif.app.workspace import Workspace
+from nerif.app.forms.elements import dialog, refusals, select, text_html
+from nerif.app.forms.form import Form
+from nerif.app.forms.job_form import JobForm
+from nerif.app.project.folder import OWN
+from nerif.app.project.workspace import Workspace
+from nerif.app.views.edits import Edits, UndoButtons
+from nerif.app.views.view_maps import magnitude_address, threshold_address
 from nerif.cli.commands.mask import Mask
 from nerif.data.measurement import Measurement
 from nerif.imaging.masks import MaskSettings, MaskShape, write_masks

@@ -9,9 +9,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
-from nerif.app.image_files import ImageFiles
-from nerif.app.jobs import Jobs
-from nerif.app.project import OWN, Contents, Project
+from nerif.app.project.folder import OWN, Contents, ProjectFolder
+from nerif.app.project.image_cache import ImageCache
+from nerif.app.project.jobs import Jobs
 from nerif.cli.commands.settings import COMMAND_LINE_ONLY
 from nerif.common.files import write_json
 from nerif.common.locks import locked
@@ -28,10 +28,10 @@ READ_ONLY = "This folder is read-only: files can be viewed, but nothing can be s
 class Workspace:
     """One project, shared by all pages and tabs; InputError if a link leads its files outside of the folder."""
 
-    def __init__(self, project: Project) -> None:
+    def __init__(self, project: ProjectFolder) -> None:
         for name in (OWN, f"{OWN}/jobs", f"{OWN}/checks", f"{OWN}/masks"):
             project.path(name)
-        self.project, self.jobs, self.files = project, Jobs(project.folder), ImageFiles(project)
+        self.project, self.jobs, self.files = project, Jobs(project.folder), ImageCache(project)
         self._drafts: dict[str, dict[str, Any]] = {}
 
     @property

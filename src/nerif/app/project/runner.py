@@ -1,4 +1,4 @@
-"""Run nerif in a process that outlives the server: `python -m nerif.app.runner DIRECTORY ARGUMENTS`.
+"""Run nerif in a process that outlives the server: `python -m nerif.app.project.runner DIRECTORY ARGUMENTS`.
 
 The process id with its start time, and later the exit code, are written to the directory. Of two processes of one
 directory, the second starts nothing.

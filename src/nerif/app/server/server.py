@@ -19,14 +19,14 @@ from nicegui import app, background_tasks, ui
 from nicegui.server import Server
 from starlette.responses import RedirectResponse
 
-from nerif.app.frame import frame
-from nerif.app.guard import Guard
-from nerif.app.page import Page
 from nerif.app.pages import PAGES
-from nerif.app.private import page_leading_to
-from nerif.app.project import Project
-from nerif.app.routes import routes
-from nerif.app.workspace import READ_ONLY, Workspace
+from nerif.app.pages.frame import frame
+from nerif.app.pages.page import Page
+from nerif.app.project.folder import ProjectFolder
+from nerif.app.project.workspace import READ_ONLY, Workspace
+from nerif.app.server.guard import Guard
+from nerif.app.server.private import page_leading_to
+from nerif.app.views.routes import routes
 from nerif.cli.commands.output import say
 from nerif.common.conventions import InputError
 
@@ -100,7 +100,7 @@ class Address:
 
 def serve(folder: Path, address: Address, browser: bool = True) -> None:
     """Serve the pages of a project until Ctrl-C; runs continue after that."""
-    work = Workspace(Project(folder))
+    work = Workspace(ProjectFolder(folder))
     if not work.project.writable:
         say(f"note: {READ_ONLY}")
     logging.getLogger("uvicorn.error").addFilter(is_relevant)
@@ -156,7 +156,7 @@ def is_relevant(record: logging.LogRecord) -> bool:
     return not (isinstance(error, RuntimeError) and str(error) == "No response returned.")
 
 
-def _first(project: Project) -> Page:
+def _first(project: ProjectFolder) -> Page:
     """The page that opens first: Results for a result directory."""
     return next(page for page in PAGES if page.name == "results") if project.is_result else PAGES[0]
 

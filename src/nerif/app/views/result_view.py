@@ -12,12 +12,12 @@ from typing import Any
 from nicegui import ui
 
 from nerif.analysis.resampling import common_grid, difference, resampled
-from nerif.app.elements import select, text_html
-from nerif.app.result_volumes import Source, source_of
-from nerif.app.slices_view import Panel, SlicesView
-from nerif.app.sliders import RangeSlider
-from nerif.app.surfaces import Surface, SurfaceView
-from nerif.app.workspace import Workspace
+from nerif.app.forms.elements import select, text_html
+from nerif.app.forms.sliders import RangeSlider
+from nerif.app.project.workspace import Workspace
+from nerif.app.views.result_volumes import Source, source_of
+from nerif.app.views.slices_view import Panel, SlicesView
+from nerif.app.views.surfaces import Surface, SurfaceView
 from nerif.common.conventions import InputError, unit_shown
 from nerif.common.files import ending
 from nerif.data.volume import Volume, describe

@@ -9,7 +9,7 @@ from pathlib import Path
 from threading import Lock
 from typing import Any
 
-from nerif.app.project import Project
+from nerif.app.project.folder import ProjectFolder
 from nerif.common.conventions import InputError
 from nerif.imaging.calibration.target_images import explain_missing
 from nerif.imaging.calibration.targets import CalibrationTarget, Detection
@@ -17,21 +17,21 @@ from nerif.imaging.quality.image_quality import ImageQuality, image_quality, jpe
 from nerif.imaging.readers.crop import Crop
 from nerif.imaging.readers.views import View
 
-__all__ = ["ImageFiles"]
+__all__ = ["ImageCache"]
 
 LIMIT = 400  # of the cache, entries
 SAMPLE = 12  # images of a source whose quality is read
 
 
-class ImageFiles:
+class ImageCache:
     """Images, quality and detected targets of the experiments of a project, cached.
 
     Parameters
     ----------
-    project : Project
+    project : ProjectFolder
     """
 
-    def __init__(self, project: Project) -> None:
+    def __init__(self, project: ProjectFolder) -> None:
         self.project = project
         self._cache: OrderedDict[tuple[Any, ...], Any] = OrderedDict()  # least recently used first
         self._lock = Lock()  # pages use the cache in threads

@@ -11,18 +11,18 @@ from pathlib import Path
 
 from nicegui import ui
 
-from nerif.app.elements import dialog, refusals, text_html
-from nerif.app.guide import guide
-from nerif.app.jobs import OPEN, Job
-from nerif.app.page import Page
-from nerif.app.result_volumes import film_progress
-from nerif.app.workspace import READ_ONLY, Workspace
+from nerif.app.forms.elements import dialog, refusals, text_html
+from nerif.app.pages.guide import guide
+from nerif.app.pages.page import Page
+from nerif.app.project.jobs import OPEN, CommandRun
+from nerif.app.project.workspace import READ_ONLY, Workspace
+from nerif.app.views.result_volumes import film_progress
 from nerif.common.files import ending
 from nerif.results.live import read_live
 
 __all__ = ["JobsDrawer", "frame"]
 
-ASSETS = Path(__file__).parent / "assets"
+ASSETS = Path(__file__).parents[1] / "assets"
 EVERY = 1.0  # seconds
 LIMIT = 30  # runs in the drawer
 ACTIONS = {
@@ -141,12 +141,12 @@ class JobsDrawer:
             if not jobs:
                 text_html("No runs yet.", classes="note")
 
-    def _jobs(self) -> tuple[list[Job], dict[str, tuple[float, str]]]:
+    def _jobs(self) -> tuple[list[CommandRun], dict[str, tuple[float, str]]]:
         """The runs, and the progress of each by its id."""
         jobs = self.work.jobs.all()
         return jobs, {job.id: _progress(self.work, job) for job in jobs}
 
-    def _row(self, job: Job, share: float, title: str) -> None:
+    def _row(self, job: CommandRun, share: float, title: str) -> None:
         state = f"{job.state}, {job.request} requested" if job.state == "running" and job.request else job.state
         with ui.element("div").classes(f"run {job.state}").props('role="listitem"'):
             ui.html(
@@ -180,7 +180,7 @@ class JobsDrawer:
             ui.html(f"<pre tabindex=0>{escape(text)}</pre>", sanitize=False)
 
 
-def _progress(work: Workspace, job: Job) -> tuple[float, str]:
+def _progress(work: Workspace, job: CommandRun) -> tuple[float, str]:
     """Return the progress of a run, 0 to 1, and its stage; 0 and an empty text if unavailable."""
     if ending(job.out) == ".zarr" and job.state in ("running", "paused"):
         return film_progress(work.project.path(job.out))

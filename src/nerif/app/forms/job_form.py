@@ -7,11 +7,11 @@ from typing import Any
 
 from nicegui import ui
 
-from nerif.app.elements import CommandLine, refusals, text_html
-from nerif.app.form_view import FormView
-from nerif.app.forms import Form
-from nerif.app.jobs import Job
-from nerif.app.workspace import Workspace
+from nerif.app.forms.elements import CommandLine, refusals, text_html
+from nerif.app.forms.form import Form
+from nerif.app.forms.form_view import FormView
+from nerif.app.project.jobs import CommandRun
+from nerif.app.project.workspace import Workspace
 from nerif.common.conventions import InputError
 
 __all__ = ["JobForm", "JobStatus"]
@@ -45,7 +45,7 @@ class JobForm:
         main: Sequence[str] = (), out: Callable[[], str] | None = None,
         before: Callable[[], Awaitable[None]] | None = None, subject: str = "",
         on_continue: Callable[[str], Awaitable[None]] | None = None, lines: int = LINES,
-        on_end: Callable[[Job], Awaitable[None]] | None = None,
+        on_end: Callable[[CommandRun], Awaitable[None]] | None = None,
     ) -> None:  # fmt: skip
         self.work, self.name, self.words, self.out, self.before = work, name, words, out, before
         self.view = FormView(form, self._on_change, work.draft(name), main)
@@ -95,7 +95,7 @@ class JobStatus:
     """
 
     def __init__(
-        self, work: Workspace, name: str, on_end: Callable[[Job], Awaitable[None]] | None = None,
+        self, work: Workspace, name: str, on_end: Callable[[CommandRun], Awaitable[None]] | None = None,
         on_continue: Callable[[str], Awaitable[None]] | None = None, lines: int = LINES,
     ) -> None:  # fmt: skip
         self.work, self.name, self.job = work, name, str(work.draft(name).get("job", ""))
@@ -106,7 +106,7 @@ class JobStatus:
             self.further = ui.element("div")
             ui.timer(EVERY, self._look)
 
-    def follow(self, job: Job) -> None:
+    def follow(self, job: CommandRun) -> None:
         """Show this run."""
         self.job = job.id
         self.work.keep(self.name, {"job": job.id})

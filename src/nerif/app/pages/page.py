@@ -6,7 +6,7 @@ from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from nerif.app.workspace import Workspace
+from nerif.app.project.workspace import Workspace
 
 __all__ = ["Hint", "Page"]
 

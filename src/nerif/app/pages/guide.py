@@ -7,10 +7,10 @@ from html import escape
 
 from nicegui import ui
 
-from nerif.app.demo import is_demo
-from nerif.app.elements import refusals
-from nerif.app.page import Hint, Page
-from nerif.app.workspace import Workspace
+from nerif.app.forms.elements import refusals
+from nerif.app.pages.page import Hint, Page
+from nerif.app.project.demo_project import is_demo
+from nerif.app.project.workspace import Workspace
 
 __all__ = ["guide", "state"]
 

@@ -15,14 +15,14 @@ from jaxtyping import Float
 from starlette.requests import Request
 from starlette.responses import FileResponse, PlainTextResponse, Response
 
-from nerif.app.result_volumes import source_of
-from nerif.app.workspace import Workspace
+from nerif.app.project.workspace import Workspace
+from nerif.app.views.result_volumes import source_of
 from nerif.common.conventions import InputError
 from nerif.common.files import ending
 from nerif.data.volume import Volume
 from nerif.report.isosurface import default_level, stl_of, surface_triangles
 from nerif.results.directory import REPORT, ResultDirectory
-from nerif.results.live import read_look
+from nerif.results.live import read_snapshot
 
 __all__ = ["bodies_address", "live_address", "report_address", "report_file", "routes", "surface_address"]
 
@@ -77,10 +77,10 @@ def _surface(work: Workspace, query: Mapping[str, str]) -> Response:
 
 
 def _live_surface(work: Workspace, query: Mapping[str, str]) -> Response:
-    look = read_look(work.project.path(query.get("of", "")))
-    if look is None:
+    snapshot = read_snapshot(work.project.path(query.get("of", "")))
+    if snapshot is None:
         raise InputError("There is no preview of the field yet.")
-    return _stl_response(look.volume, default_level(look.volume))
+    return _stl_response(snapshot.volume, default_level(snapshot.volume))
 
 
 def _stl_response(volume: Volume, level: float) -> Response:

@@ -6,7 +6,7 @@ from html import escape
 
 import torch
 
-from nerif.app.elements import images_html
+from nerif.app.forms.elements import images_html
 from nerif.data.measurement import Measurement, integrals_of
 from nerif.geometry import Camera
 from nerif.imaging.masks import MaskSettings, with_flow_masks

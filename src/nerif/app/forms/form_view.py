@@ -8,8 +8,8 @@ from typing import Any, Generic, TypeVar
 
 from nicegui import ui
 
-from nerif.app.forms import Form, FormField
-from nerif.app.sliders import Scale
+from nerif.app.forms.form import Form, FormField
+from nerif.app.forms.sliders import SliderScale
 
 __all__ = ["FormView"]
 
@@ -112,7 +112,7 @@ class FormView(Generic[T]):
 
     def _slider(self, field: FormField, control: Any, label: str) -> None:
         """Add a slider of the browser, which has keys and screen reader support."""
-        scale = Scale(*self.sliders[field.name], whole=field.kind == "integer")
+        scale = SliderScale(*self.sliders[field.name], whole=field.kind == "integer")
         slider = ui.element("input").classes("range").props("type=range min=0 step=1")
         slider.props["max"], slider.props["aria-label"] = scale.last, label
         position: list[float] = []

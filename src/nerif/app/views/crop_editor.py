@@ -9,9 +9,9 @@ from typing import Any
 
 from nicegui import ui
 
-from nerif.app.edits import Edits, UndoButtons
-from nerif.app.elements import card, refusals, select, text_html
-from nerif.app.workspace import Workspace
+from nerif.app.forms.elements import card, refusals, select, text_html
+from nerif.app.project.workspace import Workspace
+from nerif.app.views.edits import Edits, UndoButtons
 from nerif.imaging.readers.crop import Crop
 from nerif.imaging.readers.views import View, write_crops
 

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 from nicegui import ui
 
-from nerif.app.elements import table_html, text_html
-from nerif.app.surfaces import GROUND, scene_of
+from nerif.app.forms.elements import table_html, text_html
+from nerif.app.views.surfaces import GROUND, scene_of
 from nerif.common.conventions import InputError
 from nerif.geometry import Box, Camera
 from nerif.imaging.calibration.importers.importers import import_box, import_cameras

@@ -25,15 +25,15 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from nerif.app.project import OWN
-from nerif.app.runner import ENDED, JOB, LOG, STARTED, began
+from nerif.app.project.folder import OWN
+from nerif.app.project.runner import ENDED, JOB, LOG, STARTED, began
 from nerif.common.conventions import InputError
 from nerif.common.files import read_json, write_json
 from nerif.common.installation import command_line
 from nerif.common.interruption import interrupt
 from nerif.results.directory import RUN
 
-__all__ = ["OPEN", "Job", "Jobs"]
+__all__ = ["OPEN", "CommandRun", "Jobs"]
 
 LIMIT = 64  # simultaneous runs
 RESUMABLE = ("reconstruct", "sequence")
@@ -41,7 +41,7 @@ OPEN = ("running", "queued", "held", "paused")
 
 
 @dataclass(frozen=True)
-class Job:
+class CommandRun:
     """One run.
 
     Parameters
@@ -107,13 +107,13 @@ class Jobs:
 
     # -- state ---------------------------------------------------------------------------------------------------
 
-    def all(self) -> list[Job]:
+    def all(self) -> list[CommandRun]:
         """Return all runs: open ones in the order of the queue, then ended ones, latest first."""
         jobs = [job for job in map(self._read, self._names()) if job is not None]
         open_ = sorted((j for j in jobs if j.state in OPEN), key=lambda j: (OPEN.index(j.state), j.place))
         return open_ + sorted((j for j in jobs if j.state not in OPEN), key=lambda j: j.ended, reverse=True)
 
-    def get(self, id: str) -> Job:
+    def get(self, id: str) -> CommandRun:
         """Return one run; InputError if there is none with this id."""
         job = self._read(id) if id in self._names() else None
         if job is None:
@@ -134,16 +134,16 @@ class Jobs:
             return []
         return sorted(p.name for p in self.directory.iterdir() if (p / JOB).is_file())
 
-    def _of(self, job: Job) -> Path:
+    def _of(self, job: CommandRun) -> Path:
         return self.directory / job.id
 
-    def _read(self, name: str) -> Job | None:
+    def _read(self, name: str) -> CommandRun | None:
         """Return a run and its state; None if its folder is damaged or being removed."""
         where = self.directory / name
         entries = {k: v for k, v in _json(where / JOB).items() if k in ENTRIES}
         if not _is_job(entries) or entries["id"] != name:
             return None
-        job = Job(**{**entries, "arguments": tuple(entries["arguments"]), "attempt": tuple(entries["attempt"])})
+        job = CommandRun(**{**entries, "arguments": tuple(entries["arguments"]), "attempt": tuple(entries["attempt"])})
         started, ended = _json(where / STARTED), _json(where / ENDED)
         if ended:
             job = replace(job, code=int(ended["code"]), started=started.get("time", 0.0), ended=ended["time"])
@@ -164,7 +164,7 @@ class Jobs:
 
     # -- requests ------------------------------------------------------------------------------------------------
 
-    def add(self, arguments: Sequence[str], title: str, out: str = "") -> Job:
+    def add(self, arguments: Sequence[str], title: str, out: str = "") -> CommandRun:
         """Put a run at the end of the queue.
 
         Parameters
@@ -177,7 +177,7 @@ class Jobs:
             raise InputError("expected a command of nerif, got nothing", field="arguments")
         name = f"{time.strftime('%Y%m%d-%H%M%S')}-{secrets.token_hex(3)}"
         words = tuple(str(word) for word in arguments)
-        job = Job(name, title, words, words, str(out), place=time.time())
+        job = CommandRun(name, title, words, words, str(out), place=time.time())
         self._of(job).mkdir(parents=True)
         self._own[name] = None
         self._write(job)
@@ -266,7 +266,7 @@ class Jobs:
         if job.state == "running" and now is not None and now.state == "running" and now.pid:
             interrupt(now.pid)
 
-    def _write(self, job: Job) -> None:
+    def _write(self, job: CommandRun) -> None:
         write_json(self._of(job) / JOB, {name: value for name, value in asdict(job).items() if name in ENTRIES})
 
     # -- the queue -----------------------------------------------------------------------------------------------
@@ -278,12 +278,12 @@ class Jobs:
         for job in [job for job in jobs if job.state == "queued"][: max(free, 0)]:
             self._launch(job)
 
-    def _launch(self, job: Job) -> None:
+    def _launch(self, job: CommandRun) -> None:
         where = self._of(job)
         with (where / LOG).open("ab") as log:  # the runner prints why it could not start the run
             runner = self._own[job.id] = subprocess.Popen(
-                [sys.executable, "-P", "-m", "nerif.app.runner", str(where), *job.attempt], stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL, stderr=log, start_new_session=True,
+                [sys.executable, "-P", "-m", "nerif.app.project.runner", str(where), *job.attempt],
+                stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=log, start_new_session=True,
             )  # fmt: skip
 
         def wait() -> None:

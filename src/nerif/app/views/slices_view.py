@@ -9,8 +9,8 @@ from typing import Any
 
 from nicegui import ui
 
-from nerif.app.sliders import RangeSlider
-from nerif.app.workspace import Workspace
+from nerif.app.forms.sliders import RangeSlider
+from nerif.app.project.workspace import Workspace
 from nerif.data.volume import Volume
 from nerif.geometry import Grid
 from nerif.report.slice_images import bar_image, slice_aspect, slice_axes, slice_image

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from nicegui import ui
 
-from nerif.app.elements import images_html, refusals, select
-from nerif.app.jobs import Job
-from nerif.app.result_volumes import film_progress
-from nerif.app.surfaces import LiveSurface, caption_of
-from nerif.app.workspace import Workspace
+from nerif.app.forms.elements import images_html, refusals, select
+from nerif.app.project.jobs import CommandRun
+from nerif.app.project.workspace import Workspace
+from nerif.app.views.result_volumes import film_progress
+from nerif.app.views.surfaces import LiveSurface, caption_of
 from nerif.common.conventions import unit_shown
 from nerif.common.files import ending
 from nerif.data.volume import name_of
@@ -23,9 +23,9 @@ from nerif.plotting.drawing import colour_range, map_range
 from nerif.report.slice_images import slice_axes
 from nerif.report.view_images import image_address
 from nerif.results.directory import LIVE, LIVE_FIELD
-from nerif.results.live import Look, read_live, read_look
+from nerif.results.live import LiveSnapshot, read_live, read_snapshot
 
-__all__ = ["LiveView", "curve_options", "look_html", "status_html"]
+__all__ = ["LiveView", "curve_options", "snapshot_html", "status_html"]
 
 EVERY = 1.0  # seconds
 CURVES = ("loss", "residual", "residual_over_sigma", "fit_loss")
@@ -88,7 +88,7 @@ class LiveView:
         elif not jobs:
             self.status.set_content("No run has been started in this folder yet.")
 
-    async def _show(self, job: Job) -> None:
+    async def _show(self, job: CommandRun) -> None:
         out = self.work.project.path(job.out)
         if ending(out) == ".zarr":
             share, title = await self.work.in_thread(film_progress, out)
@@ -114,16 +114,16 @@ class LiveView:
 
 
 def _update(out: Path, cache: dict[str, Any]) -> tuple[dict[str, Any], tuple[str, Box, str] | None]:
-    """Return the progress of a run and, of a look that is not in the cache, images, box and caption of the surface."""
+    """Return the progress of a run and, of a snapshot not in the cache, images, box and caption of the surface."""
     stamp = _stamp(out / LIVE_FIELD)
     news = None
     if stamp and stamp != cache.get(LIVE_FIELD):
         cache[LIVE_FIELD] = stamp
-        look = read_look(out)
-        if look is not None:
-            volume = look.volume  # a 2D field has no surface
-            caption = caption_of(look) if min(volume.grid.shape) > 1 else ""
-            news = look_html(look), volume.grid.box, caption
+        snapshot = read_snapshot(out)
+        if snapshot is not None:
+            volume = snapshot.volume  # a 2D field has no surface
+            caption = caption_of(snapshot) if min(volume.grid.shape) > 1 else ""
+            news = snapshot_html(snapshot), volume.grid.box, caption
     if (stamp := _stamp(out / LIVE)) != cache.get(LIVE):
         cache[LIVE], cache["live"] = stamp, read_live(out)
     return cache.get("live", {}), news
@@ -133,7 +133,7 @@ def _stamp(path: Path) -> int:
     return path.stat().st_mtime_ns if path.is_file() else 0
 
 
-def status_html(job: Job, live: dict[str, Any], title: str = "") -> str:
+def status_html(job: CommandRun, live: dict[str, Any], title: str = "") -> str:
     """Return the status of a run as HTML; `title` is the progress of a film, which has no live.json."""
     words = {"done": "It has ended.", "paused": "Paused; the checkpoint is saved.", "queued": "It waits in the queue."}
     text = words.get(job.state, job.state.capitalize() + ".")
@@ -174,26 +174,26 @@ def curve_options(curve: dict[str, list[float | None]]) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def look_html(look: Look) -> str:
-    """Return the images of a look as HTML: measured and predicted view, three central slices."""
+def snapshot_html(snapshot: LiveSnapshot) -> str:
+    """Return the images of a snapshot as HTML: measured and predicted view, three central slices."""
     images = []
-    unit = unit_shown(look.unit)
-    for c, component in enumerate(look.components):
-        measured, predicted = look.measured[..., c], look.predicted[..., c]
+    unit = unit_shown(snapshot.unit)
+    for c, component in enumerate(snapshot.components):
+        measured, predicted = snapshot.measured[..., c], snapshot.predicted[..., c]
         limits = map_range(measured[np.isfinite(measured)], True, 0.998)
         ends = f"{limits[0]:.2g} to {limits[1]:.2g} {unit}".strip()
-        use = "withheld" if look.withheld else "fitted"
+        use = "withheld" if snapshot.withheld else "fitted"
         valid = np.isfinite(measured)
         rms = math.sqrt(float(np.mean((predicted - measured)[valid] ** 2)))
         for kind, image in (("measured", measured), ("predicted", np.where(valid, predicted, np.nan))):
             residual = "" if kind == "measured" else f"; rms residual {rms:.2g} {unit}"
-            text = f"{look.view} ({use}), {component} {kind}; {ends}{residual}"
+            text = f"{snapshot.view} ({use}), {component} {kind}; {ends}{residual}"
             images.append((image_address(image, limits), text, text))
-    z, y, x = (n // 2 for n in look.values.shape)
-    limits = colour_range(look.values)
-    for normal, image in (("z", look.values[z]), ("y", look.values[:, y]), ("x", look.values[:, :, x])):
-        middle = (look.lower["xyz".index(normal)] + look.upper["xyz".index(normal)]) / 2
-        text = f"{name_of(look.quantity)} {limits[0]:.2g} to {limits[1]:.2g} at {normal} = {middle:g} mm; "
-        text += slice_axes(look.volume.grid.box, normal)
+    z, y, x = (n // 2 for n in snapshot.values.shape)
+    limits = colour_range(snapshot.values)
+    for normal, image in (("z", snapshot.values[z]), ("y", snapshot.values[:, y]), ("x", snapshot.values[:, :, x])):
+        middle = (snapshot.lower["xyz".index(normal)] + snapshot.upper["xyz".index(normal)]) / 2
+        text = f"{name_of(snapshot.quantity)} {limits[0]:.2g} to {limits[1]:.2g} at {normal} = {middle:g} mm; "
+        text += slice_axes(snapshot.volume.grid.box, normal)
         images.append((image_address(image[::-1], limits), text, text))
-    return f"{images_html(images)}<p class=note>After {look.seconds:.0f} s, {escape(look.title)}.</p>"
+    return f"{images_html(images)}<p class=note>After {snapshot.seconds:.0f} s, {escape(snapshot.title)}.</p>"

@@ -11,7 +11,7 @@ from nicegui import ui
 
 from nerif.analysis.evaluation import rms_with_unit
 from nerif.analysis.verdict import verdict
-from nerif.app.project import Contents, Project
+from nerif.app.project.folder import Contents, ProjectFolder
 from nerif.common.conventions import InputError
 from nerif.data.velocity_sequence import VelocitySequence, open_volumes
 from nerif.reconstruction.field_files import FIELD
@@ -51,13 +51,13 @@ class Row:
     film: bool = False
 
 
-def rows_of(project: Project, contents: Contents) -> list[Row]:
+def rows_of(project: ProjectFolder, contents: Contents) -> list[Row]:
     """Return the rows of the results and then those of the films."""
     rows = [_row_of_result(project, name) for name in contents.results]
     return rows + [row for name in contents.films if (row := _row_of_film(project, name)) is not None]
 
 
-def _row_of_result(project: Project, name: str) -> Row:
+def _row_of_result(project: ProjectFolder, name: str) -> Row:
     """The row of a result, cached until the newest of its files changes."""
     out = ResultDirectory(project.path(name))
     last = max(filter(out.has, (METRICS, FIELD, RUN, LIVE, VOLUME)), key=lambda n: (out / n).stat().st_mtime_ns)
@@ -79,7 +79,7 @@ def _of(name: str, title: str, result: Result) -> Row:
     return Row(name, title, cells, word, sentence, tuple(accuracy_rows(result)) if ended else ())
 
 
-def _row_of_film(project: Project, name: str) -> Row | None:
+def _row_of_film(project: ProjectFolder, name: str) -> Row | None:
     """The row of a film, None for a store of measurements."""
     try:
         store = open_volumes(project.path(name))

@@ -1,0 +1,1 @@
+"""The server of the app: address, access, responses."""
