@@ -18,8 +18,8 @@ from typing import Any, Literal
 from benchmarks.runner import N_AMBIENT, Settings
 from nerif.analysis.evaluation import evaluate_volume
 from nerif.data.measurement import Measurement
-from nerif.data.volume import Volume
-from nerif.data.volume_file import read_volume, write_netcdf
+from nerif.data.volume import Volume, write_netcdf
+from nerif.data.volume_file import read_volume
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Grid, Ring
 from nerif.reconstruction.detail.gaussian_process import GaussianProcess

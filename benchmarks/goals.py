@@ -15,8 +15,8 @@ import torch
 from benchmarks.runner import N_AMBIENT, Settings
 from nerif.analysis.evaluation import evaluate_volume
 from nerif.data.measurement import Measurement
-from nerif.data.volume import Volume
-from nerif.data.volume_file import read_volume, write_netcdf
+from nerif.data.volume import Volume, write_netcdf
+from nerif.data.volume_file import read_volume
 from nerif.fields.phantoms import make_phantom
 from nerif.forward.path_integral import PathIntegral, project
 from nerif.forward.registry import forward_model

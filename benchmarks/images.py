@@ -19,8 +19,8 @@ from benchmarks.runner import N_AMBIENT, Settings
 from nerif.analysis.evaluation import evaluate_volume
 from nerif.analysis.prediction import predict
 from nerif.data.measurement import Measurement
-from nerif.data.volume import Volume
-from nerif.data.volume_file import read_volume, write_netcdf
+from nerif.data.volume import Volume, write_netcdf
+from nerif.data.volume_file import read_volume
 from nerif.fields.field import Field
 from nerif.fields.phantoms import Scaled, make_phantom
 from nerif.geometry import Grid, Lens, paper_rig

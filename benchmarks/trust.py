@@ -21,8 +21,7 @@ import numpy as np
 
 from benchmarks.runner import N_AMBIENT, Settings
 from nerif.analysis.evaluation import FLOW, evaluate
-from nerif.data.volume import Volume
-from nerif.data.volume_file import write_netcdf
+from nerif.data.volume import Volume, write_netcdf
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Grid, Ring
 from nerif.reconstruction.neural.neural import NeRIF

@@ -28,8 +28,8 @@ from torch import Tensor
 
 from benchmarks.runner import N_AMBIENT, ROOT, Settings, Unavailable
 from nerif.data.measurement_sequence import MeasurementSequence
-from nerif.data.velocity_sequence import COMPONENTS, VelocitySequence
-from nerif.data.volume import Volume
+from nerif.data.velocity_sequence import VelocitySequence
+from nerif.data.volume import COMPONENTS, Volume
 from nerif.data.volume_sequence import VolumeSequence
 from nerif.fields.voxel_field import VoxelField
 from nerif.flow.advected_scalar import between

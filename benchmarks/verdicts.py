@@ -18,8 +18,7 @@ from benchmarks.measurements import FAULTS, RIGS, random_case
 from benchmarks.runner import Settings, table
 from nerif.analysis.evaluation import evaluate
 from nerif.analysis.verdict import RATINGS, Verdict, verdict
-from nerif.data.volume import Volume
-from nerif.data.volume_file import write_netcdf
+from nerif.data.volume import Volume, write_netcdf
 from nerif.geometry import Grid
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.reconstructor import Reconstructor

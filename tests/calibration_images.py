@@ -9,7 +9,7 @@ import torch
 
 from nerif.geometry import Camera
 from nerif.imaging.calibration.bundle import Pose
-from nerif.imaging.calibration.targets import CalibrationTarget, Detection, ViewImages
+from nerif.imaging.calibration.targets import CalibrationTarget, Detection, TargetDetections
 from nerif.simulation.experiment import background_poses, target_poses
 
 
@@ -25,7 +25,7 @@ def detection(
 
 def target_images(
     cameras: Sequence[Camera], target: CalibrationTarget, noise: float = 0.0, poses: int = 12, backgrounds: int = 3
-) -> list[ViewImages]:
+) -> list[TargetDetections]:
     """What each camera sees of some poses in space and some on its background, noise in px."""
     rng = np.random.default_rng(7)
     free = target_poses(cameras, target, poses, seed=1)
@@ -39,5 +39,5 @@ def target_images(
             str(j): detection(camera, target, pose, noise, rng)
             for j, pose in enumerate(background_poses(camera, target, backgrounds) if backgrounds else [])
         }
-        views.append(ViewImages(camera.name, camera.image_size, facing, laid))
+        views.append(TargetDetections(camera.name, camera.image_size, facing, laid))
     return views

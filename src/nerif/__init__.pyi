@@ -7,12 +7,12 @@ from .analysis.evaluation import evaluate_volume as evaluate_volume
 from .analysis.prediction import predict as predict
 from .analysis.prediction import reproject as reproject
 from .common.conventions import InputError as InputError
-from .data.exports import export as export
-from .data.exports import export_geometry as export_geometry
+from .data.geometry_export import export_geometry as export_geometry
 from .data.measurement import Measurement as Measurement
 from .data.reprojection import Reprojection as Reprojection
 from .data.samples import sample as sample
 from .data.volume import Volume as Volume
+from .data.volume import export as export
 from .data.volume_file import read_volume as read_volume
 from .data.volume_file import read_volumes as read_volumes
 from .fields.phantoms import make_phantom as make_phantom

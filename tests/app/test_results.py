@@ -19,9 +19,8 @@ from nerif.app.project.jobs import Jobs
 from nerif.app.views.result_table import rows_of
 from nerif.app.views.result_view import ResultView
 from nerif.app.views.result_volumes import FilmVolumes, ResultVolumes
-from nerif.data.exports import export
 from nerif.data.velocity_sequence import VelocitySequence
-from nerif.data.volume import Volume
+from nerif.data.volume import Volume, export
 from nerif.data.volume_file import read_volumes
 from nerif.data.volume_sequence import VolumeSequence
 from nerif.fields.phantoms import Flame

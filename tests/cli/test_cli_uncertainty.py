@@ -15,8 +15,8 @@ import torch
 import xarray as xr
 
 from commands import metrics_of, run
-from nerif.data.volume import Volume
-from nerif.data.volume_file import read_volumes, write_netcdf
+from nerif.data.volume import Volume, write_netcdf
+from nerif.data.volume_file import read_volumes
 from nerif.fields.voxel_field import VoxelField
 from nerif.geometry import Box, Grid
 from nerif.reconstruction.reconstructor import Outcome

@@ -20,12 +20,11 @@ from nerif.common.conventions import InputError
 from nerif.common.files import write_toml
 from nerif.data import kinds
 from nerif.data.cameras_file import FORMAT
-from nerif.data.exports import export
 from nerif.data.kinds import Kind, check_kind, kind_of
 from nerif.data.measurement import Measurement
 from nerif.data.measurement_sequence import MeasurementSequence
 from nerif.data.velocity_sequence import VelocitySequence
-from nerif.data.volume import Volume
+from nerif.data.volume import Volume, export
 from nerif.data.volume_file import read_volume
 from nerif.data.volume_sequence import VolumeSequence
 from nerif.fields.network import NetworkShape

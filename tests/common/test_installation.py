@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from nerif.cli.cli import main
-from nerif.common.installation import DISTRIBUTION, install, stranger
+from nerif.common.installation import DISTRIBUTION, install, package_conflict
 
 ROOT = Path(__file__).parents[2]
 FOLDERS = ("src", "docs", "examples", "benchmarks", "tests")
@@ -56,13 +56,13 @@ def test_the_other_package_is_named_with_the_remedy(tmp_path, monkeypatch, versi
         (folder / "METADATA").write_text(f"Metadata-Version: 2.1\nName: nerif\nVersion: {version}\n")
         (folder / "entry_points.txt").write_text(f"[console_scripts]\nnerif = {command}\n")
     monkeypatch.setattr(sys, "path", [str(tmp_path)])
-    assert stranger().startswith(warning) if warning else stranger() == ""
-    assert ("pip uninstall nerif" in stranger()) == bool(warning)
+    assert package_conflict().startswith(warning) if warning else package_conflict() == ""
+    assert ("pip uninstall nerif" in package_conflict()) == bool(warning)
 
 
 def test_a_command_warns_in_one_line(tmp_path, monkeypatch, capsys):
     (tmp_path / "damaged.nc").write_text("no NetCDF")
-    monkeypatch.setattr("nerif.common.installation.stranger", lambda: "the package nerif 1.4.0")
+    monkeypatch.setattr("nerif.common.installation.package_conflict", lambda: "the package nerif 1.4.0")
     assert main(["info", str(tmp_path / "damaged.nc")]) == 2
     first, second = capsys.readouterr().err.splitlines()
     assert first == "nerif: the package nerif 1.4.0"

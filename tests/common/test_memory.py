@@ -22,8 +22,8 @@ from nerif.common import memory
 from nerif.common.conventions import InputError
 from nerif.data.measurement_file import bodies_of
 from nerif.data.measurement_sequence import MeasurementSequence
-from nerif.data.volume import Volume
-from nerif.data.volume_file import read_volume, write_netcdf
+from nerif.data.volume import Volume, write_netcdf
+from nerif.data.volume_file import read_volume
 from nerif.data.volume_sequence import VolumeSequence
 from nerif.data.vti import read_vti, write_vti
 from nerif.fields.network import NetworkShape

@@ -180,7 +180,7 @@ def test_valid_pixels_are_counted_for_each_technique(measurement):
 @pytest.mark.parametrize("distortion", [0.0, -0.1])
 def test_rays_are_traced_in_blocks_of_rows(measurement, monkeypatch, distortion):
     """A block that is masked, or beyond a smaller image, has no pixel."""
-    monkeypatch.setattr("nerif.data.measurement.PIXELS_AT_A_TIME", 3 * measurement.displacement.shape[2])
+    monkeypatch.setattr("nerif.data.measurement_data.PIXELS_AT_A_TIME", 3 * measurement.displacement.shape[2])
     cameras = [replace(c, distortion=torch.tensor([distortion, 0, 0, 0, 0]).double()) for c in measurement.cameras]
     height, width = cameras[1].image_size
     cameras[1] = cameras[1].view(0, 0, height - 12, width)

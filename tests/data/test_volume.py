@@ -13,9 +13,8 @@ import torch
 import xarray as xr
 
 from nerif.common.conventions import InputError
-from nerif.data.exports import FORMATS, export
-from nerif.data.volume import Volume
-from nerif.data.volume_file import read_volume, read_volumes, write_netcdf
+from nerif.data.volume import FORMATS, Volume, export, write_netcdf
+from nerif.data.volume_file import read_volume, read_volumes
 from nerif.geometry import Box, Grid
 from nerif.physics.quantities import GasChanges, GasSettings, derive
 from refusals import refused
@@ -89,7 +88,7 @@ def test_every_format_leaves_only_its_file(volumes, tmp_path):
 
 FULL = """
 import errno, resource, sys, torch
-from nerif.data.exports import FORMATS, export
+from nerif.data.volume import FORMATS, export
 from nerif.data.volume import Volume
 from nerif.geometry import Box, Grid
 volume = Volume(torch.rand(30, 31, 32), Grid(Box.cube(1.0), (30, 31, 32)), attributes={"n_ambient": 1.00027})

@@ -9,7 +9,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from nerif.data.exports import export_geometry
+from nerif.data.geometry_export import export_geometry
 from nerif.data.measurement import Measurement
 from nerif.geometry import TELECENTRIC, Box, Camera, Grid, Lens
 from nerif.geometry.astra import astra_of, camera_of, from_astra

@@ -16,8 +16,8 @@ from nerif.cli.cli import main
 from nerif.common.conventions import InputError
 from nerif.data.body_file import read_body
 from nerif.data.measurement import Measurement
-from nerif.data.volume import Volume
-from nerif.data.volume_file import read_volume, write_netcdf
+from nerif.data.volume import Volume, write_netcdf
+from nerif.data.volume_file import read_volume
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Grid, Ring
 from nerif.geometry.body import contained

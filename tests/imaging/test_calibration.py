@@ -15,11 +15,11 @@ from calibration_images import detection, target_images
 from nerif.common.files import read_toml
 from nerif.data.cameras_file import read_cameras
 from nerif.geometry import PROJECTIONS, TELECENTRIC, Camera, Plane, Ring
-from nerif.imaging.calibration.bundle import INTRINSIC, Bundle, Observation, Pose, _Layout, adjust
+from nerif.imaging.calibration.bundle import INTRINSIC, CameraBundle, Pose, TargetObservation, _ParameterOrder, adjust
 from nerif.imaging.calibration.calibrate import CalibrationSettings, _on_side, calibrate
 from nerif.imaging.calibration.first_guess import first_guess, mirror
 from nerif.imaging.calibration.result import Calibration
-from nerif.imaging.calibration.targets import CalibrationTarget, Detection, ViewImages
+from nerif.imaging.calibration.targets import CalibrationTarget, Detection, TargetDetections
 from nerif.simulation.experiment import side_of_one, target_poses, world_axes
 from refusals import refused
 
@@ -67,8 +67,8 @@ SETTINGS = {
 }  # fmt: skip
 
 
-def images(kind: str = "perspective", noise: float = 0.0, poses: int = 12, backgrounds: int = 3) -> list[ViewImages]:
-    return target_images(RIGS[kind], TARGET, noise, poses, backgrounds)
+def images(kind: str = "perspective", noise: float = 0, poses: int = 12, laid: int = 3) -> list[TargetDetections]:
+    return target_images(RIGS[kind], TARGET, noise, poses, laid)
 
 
 @pytest.fixture(scope="module")
@@ -150,7 +150,7 @@ def test_a_mount_adds_to_the_noise_and_is_in_the_file(tmp_path, exact):
 
 
 def test_without_background_images_planes_are_unknown():
-    result = calibrate(images(poses=8, backgrounds=0), SETTINGS["perspective"])
+    result = calibrate(images(poses=8, laid=0), SETTINGS["perspective"])
     assert result.backgrounds == (None,) * 4
     assert sum("background plane is unknown" in n for n in result.notes) == 4
 
@@ -175,7 +175,7 @@ def test_world_is_as_in_the_settings():
         assert np.allclose(b.inverse.translation, [y + 1, z + 2, x + 3], atol=1e-3)
 
 
-def changed(view: ViewImages, change: Callable[[Detection], Detection]) -> ViewImages:
+def changed(view: TargetDetections, change: Callable[[Detection], Detection]) -> TargetDetections:
     poses, background = ({n: change(d) for n, d in group.items()} for group in (view.poses, view.background))
     return replace(view, poses=poses, background=background)
 
@@ -201,13 +201,13 @@ def mirrored(detection: Detection) -> Detection:
     return Detection(ids, detection.pixels * [-1, 1] + [499, 0], TARGET.points[ids])
 
 
-def shifted(view: ViewImages) -> ViewImages:
+def shifted(view: TargetDetections) -> TargetDetections:
     """Poses under wrong names."""
     values = list(view.poses.values())
     return replace(view, poses=dict(zip(view.poses, values[1:] + values[:1], strict=True)))
 
 
-FAULTS: dict[str, Callable[[ViewImages], ViewImages]] = {
+FAULTS: dict[str, Callable[[TargetDetections], TargetDetections]] = {
     "mirrored": lambda view: changed(view, mirrored),
     "mirrored, as ChArUco": lambda view: changed(view, lambda d: replace(d, pixels=d.pixels * [-1, 1] + [499, 0])),
     "wrong names": shifted,
@@ -231,7 +231,7 @@ def test_a_view_with_a_fault_is_refused_by_name(kind, fault):
         calibrate(views, SETTINGS[kind])
 
 
-def relabelled(target: CalibrationTarget) -> list[ViewImages]:
+def relabelled(target: CalibrationTarget) -> list[TargetDetections]:
     """The same images with the points of another target."""
     return [changed(view, lambda d: replace(d, points=target.points[d.ids])) for view in images(poses=8)]
 
@@ -371,7 +371,7 @@ def test_one_telecentric_camera_alone_has_a_scale_and_poses(exact):
 # -- bundle adjustment ---------------------------------------------------------------------------------------------
 
 
-def small(kind: str) -> tuple[Bundle, list[Observation]]:
+def small(kind: str) -> tuple[CameraBundle, list[TargetObservation]]:
     """Two cameras, three or four poses, off from the truth."""
     rng = np.random.default_rng(0)
     if kind == "telecentric":
@@ -384,7 +384,7 @@ def small(kind: str) -> tuple[Bundle, list[Observation]]:
     pair = CAMERAS[1:3]
     poses = target_poses(pair, TARGET, 4, seed=3)
     observations = [
-        Observation(i, j, detection(camera, TARGET, pose, 0.0, rng))
+        TargetObservation(i, j, detection(camera, TARGET, pose, 0.0, rng))
         for i, camera in enumerate(pair)
         for j, pose in enumerate(poses)
     ]
@@ -393,13 +393,13 @@ def small(kind: str) -> tuple[Bundle, list[Observation]]:
     tilted = kind == "scheimpflug"
     k[:, 9:] = [(0.1, -0.07), (-0.05, 0.2)] if tilted else 0
     free = (*(True,) * 8, False, *(tilted,) * 2)
-    return Bundle(k, cameras, tuple(poses), 0, free, ((400, 500),) * 2), observations
+    return CameraBundle(k, cameras, tuple(poses), 0, free, ((400, 500),) * 2), observations
 
 
 @pytest.mark.parametrize("kind", [*KINDS, "scheimpflug"])
 def test_normal_equations_are_the_slope_of_the_cost(kind):
     bundle, observations = small(kind)
-    layout = _Layout(bundle, observations, noise=10.0)  # in the quadratic part of Huber's loss
+    layout = _ParameterOrder(bundle, observations, noise=10.0)  # in the quadratic part of Huber's loss
     x = layout.pack(bundle)
     cost, curvature, slope = layout.normal_equations(x)
     assert cost == pytest.approx(layout.cost(x))
@@ -416,10 +416,10 @@ def test_normal_equations_are_the_slope_of_the_cost(kind):
 def test_adjustment_ends_in_a_minimum():
     bundle, observations = small("perspective")
     result, covariance = adjust(bundle, observations, noise=0.01)
-    layout = _Layout(result, observations, 0.01)
+    layout = _ParameterOrder(result, observations, 0.01)
     x = layout.pack(result)
     minimum = layout.cost(x)
-    assert minimum < 1e-3 * _Layout(bundle, observations, 0.01).cost(layout.pack(bundle))
+    assert minimum < 1e-3 * _ParameterOrder(bundle, observations, 0.01).cost(layout.pack(bundle))
     rng = np.random.default_rng(0)
     spread = np.where(np.abs(x) > 0, np.abs(x), 1.0)
     assert all(layout.cost(x + 1e-4 * spread * rng.standard_normal(len(x))) > minimum for _ in range(20))

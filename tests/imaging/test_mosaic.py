@@ -168,7 +168,7 @@ def test_every_format_is_binned_and_the_note_reported_once(tmp_path, rng, lines,
 
 
 def test_uniform_light_becomes_a_uniform_image():
-    binning = Binning("RGGB", (1000.0, 2000.0, 2000.0, 1300.0), 4095.0)
+    binning = Binning((1000.0, 2000.0, 2000.0, 1300.0), 4095.0)
     image = np.tile(np.array([[1000, 2000], [2000, 1300]], np.uint16), (4, 5))[:7, :9]
     assert np.array_equal(binning(image), np.full((3, 4), 1575))
     assert np.array_equal(replace(binning, means=(0.0,) * 4)(image), np.full((3, 4), 1575))  # of black frames
@@ -179,7 +179,7 @@ def test_uniform_light_becomes_a_uniform_image():
 
 def test_every_filter_has_the_same_weight_but_a_nearly_dark_one():
     means = np.array([500.0, 2000.0, 2000.0, 10.0])
-    binning = Binning("RGGB", tuple(means), np.inf)
+    binning = Binning(tuple(means), np.inf)
     changes = [binning((means + 100 * np.eye(4)[k] * means / 1000).reshape(2, 2).astype(np.float32)) for k in range(4)]
     first, second, third, fourth = (
         float(x[0, 0]) - float(binning(means.reshape(2, 2).astype("f4"))[0, 0]) for x in changes
@@ -195,11 +195,11 @@ def test_a_cell_with_a_saturated_pixel_is_saturated(shift):
     image[::2, ::2] = 800 << shift
     image[4, 6] = image[11, 19] = 4095 << shift
     image[8:10, 20:22] = 4094 << shift
-    grey = Binning("RGGB", (800.0, 2000.0, 2000.0, 2000.0), full)(image)
+    grey = Binning((800.0, 2000.0, 2000.0, 2000.0), full)(image)
     assert np.argwhere(saturated(grey, full)).tolist() == [[2, 3], [5, 9]]
     plateau = np.random.default_rng(0).normal(2000, 60, (80, 80)).astype(np.uint16)
     plateau[20:40, 21:41] = 3800  # a sensor that saturates below the top of its range
-    over = saturated(Binning("RGGB", (1.0,) * 4, full)(plateau), full)
+    over = saturated(Binning((1.0,) * 4, full)(plateau), full)
     assert over[10:20, 10:21].all()
     assert over.sum() == 10 * 11
 

@@ -19,11 +19,10 @@ from mutation.mutators import make
 from nerif.cli.cli import main
 from nerif.common.conventions import InputError
 from nerif.data.cameras_file import CalibratedCamera, write_cameras
-from nerif.data.exports import export
 from nerif.data.measurement import Measurement
 from nerif.data.measurement_sequence import MeasurementSequence
-from nerif.data.volume import Volume
-from nerif.data.volume_file import read_volume, write_netcdf
+from nerif.data.volume import Volume, export, write_netcdf
+from nerif.data.volume_file import read_volume
 from nerif.fields.network import NetworkShape
 from nerif.fields.phantoms import GaussianBalls
 from nerif.fields.voxel_field import VoxelField

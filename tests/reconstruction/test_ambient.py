@@ -11,8 +11,7 @@ import torch
 from nerif.analysis.evaluation import evaluate
 from nerif.cli.cli import main
 from nerif.common.conventions import InputError
-from nerif.data.volume import Volume
-from nerif.data.volume_file import write_netcdf
+from nerif.data.volume import Volume, write_netcdf
 from nerif.fields.voxel_field import VoxelField
 from nerif.geometry import Grid
 from nerif.reconstruction.reconstructor import Outcome, Reconstruction

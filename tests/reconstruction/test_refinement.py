@@ -13,8 +13,7 @@ from nerif.analysis.alignment import MovedField, aligned
 from nerif.cli.cli import main
 from nerif.data.cameras_file import read_cameras
 from nerif.data.measurement import Measurement
-from nerif.data.volume import Volume
-from nerif.data.volume_file import write_netcdf
+from nerif.data.volume import Volume, write_netcdf
 from nerif.fields.phantoms import make_phantom
 from nerif.forward.absorption import Absorption
 from nerif.forward.path_integral import PathIntegral, project

@@ -19,7 +19,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerif.common.conventions import InputError, percent
-from nerif.data.measurement import Measurement, Observation
+from nerif.data.measurement import Measurement
+from nerif.data.measurement_data import Observation
 from nerif.geometry import Camera
 from nerif.geometry.symmetry import Symmetry
 

@@ -30,7 +30,8 @@ from nerif.analysis.prediction import predict_view
 from nerif.common.blocks import blocks
 from nerif.common.conventions import FACES, InputError
 from nerif.common.findings import Finding
-from nerif.data.measurement import Measurement, Observation, integrals_of, measurement_of
+from nerif.data.measurement import Measurement, measurement_of
+from nerif.data.measurement_data import Observation, integrals_of
 from nerif.data.volume import INDEX
 from nerif.fields.field import Field
 from nerif.forward.forward_model import ForwardModel

@@ -22,7 +22,8 @@ from nerif.analysis.prediction import check_sees, reproject
 from nerif.analysis.residuals import white_noise, whiteness
 from nerif.common.arrays import filled
 from nerif.common.conventions import InputError, with_unit
-from nerif.data.measurement import Measurement, Observation
+from nerif.data.measurement import Measurement
+from nerif.data.measurement_data import Observation
 from nerif.data.reprojection import Reprojection
 from nerif.data.volume import INDEX, Volume
 from nerif.data.volume_file import read_volume

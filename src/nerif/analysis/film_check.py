@@ -39,7 +39,8 @@ from nerif.common.conventions import InputError
 from nerif.common.findings import Finding
 from nerif.common.installation import quoted, word_of
 from nerif.common.times import whole_steps
-from nerif.data.measurement import MASKS, Measurement, integrals_of
+from nerif.data.measurement import Measurement
+from nerif.data.measurement_data import MASKS, integrals_of
 from nerif.reconstruction.aperture import apply_aperture
 from nerif.reconstruction.device import on_free_cores
 

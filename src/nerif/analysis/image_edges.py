@@ -17,7 +17,8 @@ from torch import Tensor
 
 from nerif.common.arrays import Points
 from nerif.common.conventions import FACES
-from nerif.data.measurement import Measurement, Observation
+from nerif.data.measurement import Measurement
+from nerif.data.measurement_data import Observation
 from nerif.geometry import Camera, Grid
 
 __all__ = ["CutEdge", "cut_edges", "cut_sentence"]

@@ -8,7 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from nerif.analysis.verdict import RATINGS, Verdict
-from nerif.data.velocity_sequence import COMPONENTS, VelocitySequence
+from nerif.data.velocity_sequence import VelocitySequence
+from nerif.data.volume import COMPONENTS
 
 __all__ = ["MOST_MISFIT", "known_share", "relative_deviation", "velocity_verdict"]
 

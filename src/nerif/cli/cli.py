@@ -99,9 +99,9 @@ def _run(words: list[str]) -> int:
 
     from nerif.cli.arguments import check_arguments
     from nerif.common.conventions import InputError
-    from nerif.common.installation import stranger
+    from nerif.common.installation import package_conflict
 
-    if warning := stranger():
+    if warning := package_conflict():
         print(f"nerif: {warning}", file=sys.stderr)
     try:
         check_arguments(words[0], words[1:])

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 from nerif.common.files import WINDOWS
 
-__all__ = ["DISTRIBUTION", "command_line", "install", "quoted", "stranger", "word_of"]
+__all__ = ["DISTRIBUTION", "command_line", "install", "package_conflict", "quoted", "word_of"]
 
 DISTRIBUTION = "nerif-bost"
 COMMAND = "nerif.cli.cli:main"
@@ -41,7 +41,7 @@ def quoted(word: str) -> str:
     return list2cmdline([word])
 
 
-def stranger() -> str:
+def package_conflict() -> str:
     """Return a warning with the remedy if the other project's package `nerif` is installed, else an empty string."""
     from importlib.metadata import distributions
 

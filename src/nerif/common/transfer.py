@@ -7,10 +7,10 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-__all__ = ["constant", "sent"]
+__all__ = ["constant", "to_device"]
 
 
-def sent(x: Tensor, device: torch.device) -> Tensor:
+def to_device(x: Tensor, device: torch.device) -> Tensor:
     """Return a CPU tensor on a device; the copy to a GPU is asynchronous."""
     return x if device.type == "cpu" else x.pin_memory().to(device, non_blocking=True)
 

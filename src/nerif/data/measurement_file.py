@@ -17,7 +17,7 @@ from nerif.common.conventions import COMPONENTS, DEFAULT_AMBIENT_FACES, InputErr
 from nerif.common.memory import check_memory
 from nerif.common.netcdf import reading, values
 from nerif.data.kinds import BOST, known_conventions
-from nerif.data.measurement import MASKS, Measurement, Region
+from nerif.data.measurement_data import MASKS, MeasurementData, Region
 from nerif.forward.deflection import Deflection
 from nerif.forward.forward_model import ForwardModel
 from nerif.forward.registry import TECHNIQUES, technique
@@ -101,7 +101,7 @@ def encoding(dataset: xr.Dataset) -> dict[str, dict[str, Any]]:
     return packing
 
 
-def to_dataset(measurement: Measurement) -> xr.Dataset:
+def to_dataset(measurement: MeasurementData) -> xr.Dataset:
     """Return the variables and attributes of the file; maps in single precision are not copied."""
     import xarray as xr
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 import torch
 
 from nerif.common.conventions import with_unit
-from nerif.data.measurement import Measurement, Observation
+from nerif.data.measurement_data import MeasurementData, Observation
 from nerif.forward.deflection import Deflection
 from nerif.plotting.notebook import PIXELS, number, panel, show_views
 
 __all__ = ["as_html", "summary", "valid_pixels"]
 
 
-def summary(measurement: Measurement, withheld: int = 0) -> list[tuple[str, str]]:
+def summary(measurement: MeasurementData, withheld: int = 0) -> list[tuple[str, str]]:
     """Return names and values with units; `withheld`: number of views not used."""
     cameras = measurement.cameras
     sizes = sorted({c.image_size for c in cameras})
@@ -30,7 +30,7 @@ def summary(measurement: Measurement, withheld: int = 0) -> list[tuple[str, str]
     ]
 
 
-def valid_pixels(measurement: Measurement) -> str:
+def valid_pixels(measurement: MeasurementData) -> str:
     """Return the share of valid pixels of all images; of each technique, if there are several."""
     sizes = torch.tensor([c.image_size for c in measurement.cameras], dtype=torch.float64).prod(dim=1)
     shares = {
@@ -41,14 +41,14 @@ def valid_pixels(measurement: Measurement) -> str:
     return ", ".join(f"{share:.1%} ({name})" if several else f"{share:.1%}" for name, share in shares.items())
 
 
-def _lenses(measurement: Measurement) -> list[tuple[str, str]]:
+def _lenses(measurement: MeasurementData) -> list[tuple[str, str]]:
     diameters = sorted({c.lens.diameter for c in measurement.cameras if c.lens is not None} - {0.0})
     if not diameters:
         return []
     return [("Aperture", " to ".join(f"{d:.3g}" for d in diameters[:: max(len(diameters) - 1, 1)]) + " mm")]
 
 
-def _sizes(measurement: Measurement, observation: Observation) -> list[tuple[str, str]]:
+def _sizes(measurement: MeasurementData, observation: Observation) -> list[tuple[str, str]]:
     """Return the sizes of values and noise of a technique, of rays that cross the box."""
     kind, usable = observation.technique, measurement.usable_for(observation) & measurement.sees_box
     squares, noise, largest = 0.0, 0.0, 0.0
@@ -67,13 +67,13 @@ def _sizes(measurement: Measurement, observation: Observation) -> list[tuple[str
     ]
 
 
-def as_html(measurement: Measurement) -> str:
+def as_html(measurement: MeasurementData) -> str:
     """Return the maps of the views by every technique, and the summary."""
     images = [(_image(measurement, o), o.caption) for o in measurement.observations]
-    return panel("Measurement", measurement.summary(), *images)
+    return panel("Measurement", summary(measurement), *images)
 
 
-def _image(measurement: Measurement, observation: Observation) -> str:
+def _image(measurement: MeasurementData, observation: Observation) -> str:
     """Return the coarsened maps of the views with data of a technique."""
     usable, names, maps = measurement.usable_for(observation), [], []
     for i, camera in enumerate(measurement.cameras):

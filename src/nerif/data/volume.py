@@ -1,10 +1,13 @@
-"""A Volume: values at voxel centres."""
+"""A volume: values at voxel centres; and its formats: VTK (.vti, for ParaView), NetCDF, NumPy, MATLAB, text (.csv)."""
 
 from __future__ import annotations
 
+import json
 import os
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,13 +18,19 @@ from torch import Tensor
 from nerif.common.arrays import make_tensors
 from nerif.common.axis_order import order_remedy
 from nerif.common.conventions import STATISTICS, InputError, ambient_index
+from nerif.common.files import atomic, ending
+from nerif.common.netcdf import write_dataset
+from nerif.data.vti import write_vti
 from nerif.geometry import Grid
 
 if TYPE_CHECKING:
     import xarray as xr
     from matplotlib.figure import Figure
 
-__all__ = ["FLOW_QUANTITIES", "INDEX", "QUANTITIES", "Volume", "describe", "field_of", "name_of", "quantities_of"]
+__all__ = [
+    "COMPONENTS", "FLOW_QUANTITIES", "FORMATS", "INDEX", "QUANTITIES", "REFERENCES", "Volume", "describe", "export",
+    "field_of", "name_of", "quantities_of", "to_dataset", "write_csv", "write_mat", "write_netcdf", "write_npz",
+]  # fmt: skip
 
 QUANTITIES = {
     "index_excess": ("1", "refractive index minus that of the ambient"),
@@ -45,8 +54,11 @@ FLOW_QUANTITIES = {
 }
 """Unit and long name of the quantities of a flow."""
 
+COMPONENTS = ("u", "v", "w")
 INDEX = "index_excess"
 INDEX_QUANTITIES = (INDEX, "n", "density", "temperature")
+CELL_METHODS = {"mean": "mean", "std": "standard_deviation"}  # of CF
+REFERENCES = "Y. He et al., Neural refractive index field, arXiv:2409.14722"
 
 
 def quantities_of(quantity: str) -> tuple[str, ...]:
@@ -141,15 +153,11 @@ class Volume:
 
     def to_xarray(self) -> xr.DataArray:
         """Return the values with coordinates x, y, z in mm, unit and attributes."""
-        from nerif.data.volume_file import to_dataset
-
         dataset = to_dataset([self])
         return dataset[self.quantity].assign_attrs(dataset.attrs)
 
     def write(self, path: str | os.PathLike[str], force: bool = False) -> None:
         """Write a file in the format of its ending (.vti, .nc, .npz, .mat, .csv); over another with `force`."""
-        from nerif.data.exports import export
-
         export(path, [self], force)
 
     def plot(self) -> Figure:
@@ -190,3 +198,120 @@ class Volume:
 
         title = describe(self.quantity)[1].capitalize()
         return panel(title, self.summary(), (show_slices(self), f"{title} in the three middle slices"))
+
+
+def export(path: str | os.PathLike[str], volumes: list[Volume], force: bool = False) -> None:
+    """Write volumes on one grid in the format of the ending of `path`, one of FORMATS; over a file with `force`."""
+    if ending(path) not in FORMATS:
+        raise InputError(f"expected a name ending in {', '.join(FORMATS)}, got '{Path(path).suffix}'", field=path)
+    if not volumes:
+        raise InputError("expected at least one volume, got none", field="volumes")
+    if Path(path).exists() and not force:
+        raise InputError("exists already and was left as it is; give another name, or force=True", field=path)
+    FORMATS[ending(path)](path, volumes)
+
+
+def write_netcdf(path: str | os.PathLike[str], volumes: list[Volume]) -> None:
+    """Write volumes on one grid to a NetCDF-4 file with CF conventions, coordinates in mm, atomically."""
+    dataset = to_dataset(volumes)
+    encoding = {str(name): {"zlib": True, "complevel": 4} for name in dataset.data_vars}
+    write_dataset(path, dataset, encoding)
+
+
+def to_dataset(volumes: list[Volume]) -> xr.Dataset:
+    """Return the variables and attributes of the file of volumes on one grid."""
+    from datetime import UTC, datetime
+
+    import xarray as xr
+
+    from nerif import __version__
+
+    grid = volumes[0].grid
+    coordinates = {
+        a: (a, grid.axis(a).numpy(), {"units": "mm", "axis": a.upper(), "long_name": f"{a} of the voxel centre"})
+        for a in "zyx"
+    }
+    data: dict[str, tuple] = {}
+    attributes: dict[str, float | str] = {}
+    for v in volumes:
+        if v.grid != grid:
+            raise InputError(
+                f"expected the grid of '{volumes[0].quantity}', got another", field=f"volume '{v.quantity}'"
+            )
+        about = {"units": v.unit, "long_name": describe(v.quantity)[1], **_cf(v.quantity, volumes), **v.notes}
+        data[v.quantity] = (("z", "y", "x"), v.values.cpu().numpy(), about)
+        attributes |= v.attributes
+    dataset = xr.Dataset(data, coords=coordinates)
+    dataset.attrs = {
+        "Conventions": "CF-1.11",
+        "title": f"Field of {name_of(field_of(data) or volumes[0].quantity)}",
+        "source": f"nerif {__version__}",
+        "history": f"{datetime.now(UTC).isoformat(timespec='seconds')} written by nerif {__version__}",
+        "references": REFERENCES,
+        **attributes,
+        # a single voxel centre does not determine the box
+        "box_lower_mm": list(grid.box.lower),
+        "box_upper_mm": list(grid.box.upper),
+    }
+    return dataset
+
+
+def _cf(quantity: str, volumes: list[Volume]) -> dict[str, str]:
+    """Return the CF attributes that relate a quantity and its statistics."""
+    base, _, statistic = quantity.rpartition("_")
+    if statistic in STATISTICS and base in QUANTITIES:
+        return {"cell_methods": f"realization: {CELL_METHODS[statistic]}"} if statistic in CELL_METHODS else {}
+    statistics = [v.quantity for v in volumes if v.quantity in [f"{quantity}_{name}" for name in STATISTICS]]
+    return {"ancillary_variables": " ".join(statistics)} if statistics else {}
+
+
+def _write_vti(path: str | os.PathLike[str], volumes: list[Volume]) -> None:
+    arrays = {v.quantity: v.values for v in volumes}
+    if all(name in arrays for name in COMPONENTS):
+        arrays["velocity"] = torch.stack([arrays.pop(name) for name in COMPONENTS])
+    write_vti(path, arrays, volumes[0].grid, _attributes(volumes))
+
+
+def _attributes(volumes: list[Volume]) -> dict[str, float | str]:
+    """Return the attributes of all, then unit and notes of each quantity as density.assumption and the like."""
+    attributes: dict[str, float | str] = {}
+    for v in volumes:
+        attributes |= v.attributes
+    for v in volumes:
+        attributes |= {f"{v.quantity}.{name}": value for name, value in {"units": v.unit, **v.notes}.items()}
+    return attributes
+
+
+def write_npz(path: str | os.PathLike[str], volumes: list[Volume]) -> None:
+    """Write arrays [z, y, x] by quantity, x_mm, y_mm, z_mm, and units and attributes as JSON in `about`."""
+    arrays: dict[str, Any] = {v.quantity: v.values.cpu().numpy() for v in volumes}
+    arrays |= {f"{a}_mm": volumes[0].grid.axis(a).numpy() for a in "xyz"}
+    arrays["about"] = np.array(json.dumps(_attributes(volumes)))
+    with atomic(path) as part, part.open("wb") as file:
+        np.savez_compressed(file, **arrays)
+
+
+def write_mat(path: str | os.PathLike[str], volumes: list[Volume]) -> None:
+    """Write a MATLAB 5 file: A(i, j, k) of each quantity is at x_mm(i), y_mm(j), z_mm(k); attributes in `about`.
+
+    For plots with rows along y: isosurface(x_mm, y_mm, z_mm, permute(density, [2 1 3]), level).
+    """
+    from scipy.io import savemat
+
+    data: dict[str, Any] = {v.quantity: v.values.cpu().numpy().transpose(2, 1, 0) for v in volumes}
+    data |= {f"{a}_mm": volumes[0].grid.axis(a).numpy()[:, None] for a in "xyz"}
+    data["about"] = {re.sub(r"\W", "_", name): value for name, value in _attributes(volumes).items()}
+    with atomic(path) as part, part.open("wb") as file:
+        savemat(file, data, do_compression=True, long_field_names=True)
+
+
+def write_csv(path: str | os.PathLike[str], volumes: list[Volume]) -> None:
+    """Write one line per voxel: x, y, z in mm, and the quantities."""
+    points = volumes[0].grid.points(torch.float64).reshape(-1, 3)
+    columns = [points, *(v.values.cpu().double().reshape(-1, 1) for v in volumes)]
+    header = ",".join(["x_mm", "y_mm", "z_mm", *(f"{v.quantity} [{v.unit}]" for v in volumes)])
+    with atomic(path) as part:
+        np.savetxt(part, torch.cat(columns, dim=1).numpy(), delimiter=",", header=header, comments="", fmt="%.9g")
+
+
+FORMATS = {".vti": _write_vti, ".nc": write_netcdf, ".npz": write_npz, ".mat": write_mat, ".csv": write_csv}

@@ -1,4 +1,4 @@
-"""Files of volumes: NetCDF written and read, VTK images read."""
+"""Volumes read from NetCDF and VTK images."""
 
 from __future__ import annotations
 
@@ -11,76 +11,20 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nerif.common.conventions import LARGEST_INDEX, LARGEST_LENGTH, STATISTICS, InputError
+from nerif.common.conventions import LARGEST_INDEX, LARGEST_LENGTH, InputError
 from nerif.common.files import ending, instead_of_file
-from nerif.common.netcdf import opened, values, write_dataset
+from nerif.common.netcdf import opened, values
 from nerif.data.kinds import VOLUME, reading_as
-from nerif.data.volume import QUANTITIES, Volume, describe, field_of, name_of
+from nerif.data.volume import QUANTITIES, Volume, describe, field_of
 from nerif.data.vti import read_vti
 from nerif.geometry import Box, Grid
 
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["REFERENCES", "read_volume", "read_volumes", "to_dataset", "write_netcdf"]
+__all__ = ["read_volume", "read_volumes"]
 
-CELL_METHODS = {"mean": "mean", "std": "standard_deviation"}  # of CF
-REFERENCES = "Y. He et al., Neural refractive index field, arXiv:2409.14722"
 Content = tuple[dict[str, Tensor], Grid, dict[str, float | str]]  # arrays, grid, attributes
-
-
-def write_netcdf(path: str | os.PathLike[str], volumes: list[Volume]) -> None:
-    """Write volumes on one grid to a NetCDF-4 file with CF conventions, coordinates in mm, atomically."""
-    dataset = to_dataset(volumes)
-    encoding = {str(name): {"zlib": True, "complevel": 4} for name in dataset.data_vars}
-    write_dataset(path, dataset, encoding)
-
-
-def to_dataset(volumes: list[Volume]) -> xr.Dataset:
-    """Return the variables and attributes of the file of volumes on one grid."""
-    from datetime import UTC, datetime
-
-    import xarray as xr
-
-    from nerif import __version__
-
-    grid = volumes[0].grid
-    coordinates = {
-        a: (a, grid.axis(a).numpy(), {"units": "mm", "axis": a.upper(), "long_name": f"{a} of the voxel centre"})
-        for a in "zyx"
-    }
-    data: dict[str, tuple] = {}
-    attributes: dict[str, float | str] = {}
-    for v in volumes:
-        if v.grid != grid:
-            raise InputError(
-                f"expected the grid of '{volumes[0].quantity}', got another", field=f"volume '{v.quantity}'"
-            )
-        about = {"units": v.unit, "long_name": describe(v.quantity)[1], **_cf(v.quantity, volumes), **v.notes}
-        data[v.quantity] = (("z", "y", "x"), v.values.cpu().numpy(), about)
-        attributes |= v.attributes
-    dataset = xr.Dataset(data, coords=coordinates)
-    dataset.attrs = {
-        "Conventions": "CF-1.11",
-        "title": f"Field of {name_of(field_of(data) or volumes[0].quantity)}",
-        "source": f"nerif {__version__}",
-        "history": f"{datetime.now(UTC).isoformat(timespec='seconds')} written by nerif {__version__}",
-        "references": REFERENCES,
-        **attributes,
-        # a single voxel centre does not determine the box
-        "box_lower_mm": list(grid.box.lower),
-        "box_upper_mm": list(grid.box.upper),
-    }
-    return dataset
-
-
-def _cf(quantity: str, volumes: list[Volume]) -> dict[str, str]:
-    """Return the CF attributes that relate a quantity and its statistics."""
-    base, _, statistic = quantity.rpartition("_")
-    if statistic in STATISTICS and base in QUANTITIES:
-        return {"cell_methods": f"realization: {CELL_METHODS[statistic]}"} if statistic in CELL_METHODS else {}
-    statistics = [v.quantity for v in volumes if v.quantity in [f"{quantity}_{name}" for name in STATISTICS]]
-    return {"ancillary_variables": " ".join(statistics)} if statistics else {}
 
 
 def read_volume(path: str | os.PathLike[str], quantity: str | None = None, gaps: bool = False) -> Volume:

@@ -15,8 +15,7 @@ from nerif.common.netcdf import reading
 from nerif.common.times import check_interval, interval, seconds
 from nerif.data.kinds import SEQUENCE_RESULT, TRUE_SEQUENCE, Kind, check_kind, reading_as
 from nerif.data.measurement_sequence import ZARR_FORMAT, add_frames, check_instants, check_store, require_zarr
-from nerif.data.volume import Volume, describe, field_of, name_of
-from nerif.data.volume_file import REFERENCES
+from nerif.data.volume import REFERENCES, Volume, describe, field_of, name_of
 from nerif.forward.forward_model import ForwardModel
 from nerif.forward.registry import ASSUMED, technique
 from nerif.geometry import Box, Grid
@@ -25,14 +24,14 @@ if TYPE_CHECKING:
     import numpy as np
     import zarr
 
-__all__ = ["FIELDS", "ViewScores", "VolumeSequence", "score_names"]
+__all__ = ["FIELDS", "StoredViewScores", "VolumeSequence", "score_names"]
 
 FIELDS = ("fields over time", "box_lower_mm")
 """Content of such a store, and an attribute that marks it."""
 
 
 @dataclass(frozen=True)
-class ViewScores:
+class StoredViewScores:
     """Agreement of the re-projection with the views by one technique, on disk.
 
     Parameters
@@ -158,11 +157,11 @@ class VolumeSequence:
             return np.asarray(array[index])
 
     @property
-    def view_scores(self) -> list[ViewScores]:
+    def view_scores(self) -> list[StoredViewScores]:
         """Agreement of re-projection and views by technique; empty for a store of volumes only."""
         names = score_names([technique(name) for name in self.attributes.get("techniques", [ASSUMED.name])])
         present = [(kind, cc, rms) for kind, (cc, rms) in names.items() if cc in self.group]
-        return [ViewScores(kind, self.array(cc), self.array(rms)) for kind, cc, rms in present]
+        return [StoredViewScores(kind, self.array(cc), self.array(rms)) for kind, cc, rms in present]
 
     @property
     def quantities(self) -> tuple[str, ...]:

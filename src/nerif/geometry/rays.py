@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int16
 from torch import Tensor
 
 from nerif.common.conventions import InputError
-from nerif.common.transfer import constant, sent
+from nerif.common.transfer import constant, to_device
 from nerif.geometry.grid import Box
 from nerif.geometry.lens import Columns, LensDiscs, spread_points
 
@@ -172,7 +172,7 @@ class Rays(Columns):
         generator : of their places; None: the same places in each call
         """
         points = spread_points(len(self), each, generator).to(self.near.dtype)
-        return self.through(sent(points, self.near.device))
+        return self.through(to_device(points, self.near.device))
 
     def _of_window(
         self, square: Float[Tensor, "n k 2"]

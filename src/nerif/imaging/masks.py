@@ -16,7 +16,8 @@ from nerif.common.conventions import InputError, unit_shown
 from nerif.common.files import atomic, ending, is_file_name
 from nerif.common.image_names import FOLDER_SUFFIXES
 from nerif.common.settings import NonNegative, Positive, check_settings
-from nerif.data.measurement import Measurement, Observation, integrals_of
+from nerif.data.measurement import Measurement
+from nerif.data.measurement_data import Observation, integrals_of
 from nerif.imaging.readers.frames import as_float
 from nerif.imaging.readers.open import read_mask
 

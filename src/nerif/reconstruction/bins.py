@@ -18,7 +18,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerif.common.blocks import blocks
-from nerif.data.measurement import Measurement, Observation
+from nerif.data.measurement import Measurement
+from nerif.data.measurement_data import Observation
 from nerif.geometry import Box, Camera, Rays
 
 __all__ = ["binned_rays", "coarsest_edge", "patches", "pixel_subset", "withhold_pixels"]

@@ -16,7 +16,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerif.common.conventions import InputError
-from nerif.data.measurement import Measurement, Region
+from nerif.data.measurement import Measurement
+from nerif.data.measurement_data import Region
 from nerif.data.volume import INDEX
 from nerif.geometry import Box, Grid
 from nerif.geometry.body import Body, contained

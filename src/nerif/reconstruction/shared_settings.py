@@ -7,7 +7,7 @@ from typing import Final, Literal
 
 from nerif.common.conventions import ambient_index, parse_faces
 from nerif.common.settings import NonNegative, check_settings
-from nerif.data.measurement import Region, check_region
+from nerif.data.measurement_data import Region, check_region
 from nerif.geometry.symmetry import NO_SYMMETRY, parse_symmetry
 from nerif.reconstruction.bounds import check_bounds
 from nerif.reconstruction.reconstructor import Reconstructor

@@ -18,7 +18,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerif.common.conventions import InputError
-from nerif.data.measurement import Measurement, Observation
+from nerif.data.measurement import Measurement
+from nerif.data.measurement_data import Observation
 from nerif.forward.forward_model import masked_blur
 
 __all__ = ["Stage", "check_source", "of_source", "resolve_source", "stages"]

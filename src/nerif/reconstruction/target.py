@@ -10,8 +10,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerif.common.conventions import InputError
-from nerif.common.transfer import sent
-from nerif.data.measurement import Measurement, Observation
+from nerif.common.transfer import to_device
+from nerif.data.measurement import Measurement
+from nerif.data.measurement_data import Observation
 from nerif.forward.forward_model import ForwardModel
 from nerif.forward.registry import AUTO, forward_models
 from nerif.geometry import Rays
@@ -134,7 +135,7 @@ class Target:
         parts, first = [], 0
         for part in self.parts:
             inside = index[(index >= first) & (index < first + len(part))]
-            parts.append(part[sent(inside - first, part.measured.device)])
+            parts.append(part[to_device(inside - first, part.measured.device)])
             first += len(part)
         return replace(self, parts=tuple(parts))
 

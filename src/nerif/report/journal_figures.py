@@ -16,7 +16,7 @@ from nerif.common.arrays import filled
 from nerif.common.conventions import with_unit
 from nerif.common.files import atomic
 from nerif.common.written_files import OwnFiles
-from nerif.data.measurement import Observation
+from nerif.data.measurement_data import Observation
 from nerif.data.reprojection import Reprojection
 from nerif.data.volume import INDEX, Volume
 from nerif.plotting import drawing

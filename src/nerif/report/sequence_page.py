@@ -11,7 +11,7 @@ import numpy as np
 
 from nerif.common.conventions import InputError, with_unit
 from nerif.data.volume import field_of
-from nerif.data.volume_sequence import ViewScores, VolumeSequence
+from nerif.data.volume_sequence import StoredViewScores, VolumeSequence
 from nerif.forward.registry import technique, technique_of
 from nerif.plotting.drawing import plain
 from nerif.plotting.notebook import number
@@ -117,7 +117,7 @@ def _curves(store: VolumeSequence, frames: list[int]) -> list[tuple[str, str]]:
     names, withheld = store.attributes["views"], store.attributes.get("withhold", ())
     seconds = np.asarray(store.array("seconds")[:])[frames]
 
-    def draw_rms(of: ViewScores, axes: Axes) -> None:
+    def draw_rms(of: StoredViewScores, axes: Axes) -> None:
         rms = np.asarray(of.rms[:])[frames]
         for i, name in enumerate(names):
             if np.isfinite(rms[:, i]).any():
@@ -136,5 +136,5 @@ def _curves(store: VolumeSequence, frames: list[int]) -> list[tuple[str, str]]:
     return [*views, ("Computing time of each frame", svg(draw_seconds))]
 
 
-def _suffix(one: ViewScores, scores: list[ViewScores]) -> str:
+def _suffix(one: StoredViewScores, scores: list[StoredViewScores]) -> str:
     return f", {one.technique.measured}" if len(scores) > 1 else ""

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from nerif.analysis.velocity_verdict import known_share, relative_deviation, velocity_verdict
-from nerif.data.velocity_sequence import COMPONENTS, VelocitySequence
+from nerif.data.velocity_sequence import VelocitySequence
+from nerif.data.volume import COMPONENTS
 from nerif.plotting.notebook import image, number
 from nerif.report.html import flat, render_page, svg
 from nerif.report.scene import scene_over_time

@@ -12,7 +12,8 @@ from jaxtyping import Float
 
 from nerif.common.blocks import blocks
 from nerif.common.conventions import unit_shown
-from nerif.data.measurement import Measurement, Observation
+from nerif.data.measurement import Measurement
+from nerif.data.measurement_data import Observation
 from nerif.data.reprojection import Reprojection
 from nerif.plotting.drawing import map_colours, map_range
 from nerif.results.metrics_file import ViewScores

@@ -18,13 +18,12 @@ from nerif.common.files import atomic, is_near, read_toml, recorded, write_toml
 from nerif.common.installation import command_line, word_of
 from nerif.common.locks import LOCK, locked
 from nerif.common.written_files import WARN, WRITTEN, OwnFiles, remove_empty
-from nerif.data.exports import export
 from nerif.data.kinds import RESULT, RUN, check_kind
 from nerif.data.measurement import Measurement
 from nerif.data.meridian import Meridian
 from nerif.data.reprojection import Reprojection
 from nerif.data.surface import SurfaceMap
-from nerif.data.volume import INDEX, Volume, field_of
+from nerif.data.volume import INDEX, Volume, export, field_of
 from nerif.data.volume_file import read_volume, read_volumes
 from nerif.fields.field import Field
 from nerif.geometry import Box, Grid

@@ -24,7 +24,8 @@ from nerif.common.files import atomic, read_json, write_json
 from nerif.common.netcdf import reading
 from nerif.common.npz import open_npz
 from nerif.common.written_files import WARN, OwnFiles
-from nerif.data.measurement import Measurement, Observation
+from nerif.data.measurement import Measurement
+from nerif.data.measurement_data import Observation
 from nerif.data.volume import Volume, describe
 from nerif.fields.field import Field
 from nerif.forward.forward_model import ForwardModel

@@ -19,8 +19,7 @@ from nerif.common.conventions import InputError
 from nerif.common.files import write_toml
 from nerif.common.written_files import WRITTEN, OwnFiles
 from nerif.data.cameras_file import CalibratedCamera, write_cameras
-from nerif.data.volume import Volume
-from nerif.data.volume_file import write_netcdf
+from nerif.data.volume import Volume, write_netcdf
 from nerif.fields.field import Field
 from nerif.geometry import Box, Camera, Grid
 from nerif.imaging.calibration.bundle import Pose

@@ -23,8 +23,8 @@ from nerif.common.locks import locked
 from nerif.common.times import check_interval, interval, same_instants
 from nerif.data.kinds import SEQUENCE, kind_of
 from nerif.data.measurement_sequence import MeasurementSequence, check_store
-from nerif.data.velocity_sequence import COMPONENTS, VelocitySequence
-from nerif.data.volume import INDEX
+from nerif.data.velocity_sequence import VelocitySequence
+from nerif.data.volume import COMPONENTS, INDEX
 from nerif.data.volume_sequence import FIELDS, VolumeSequence
 from nerif.flow.assimilation import Iterate, State, VelocityFit
 from nerif.flow.box_domain import Space, section_of

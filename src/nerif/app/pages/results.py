@@ -22,7 +22,7 @@ from nerif.cli.commands.export import Export
 from nerif.cli.commands.figures import Figures
 from nerif.cli.commands.movie import MovieCommand
 from nerif.common.installation import install, word_of
-from nerif.data.exports import FORMATS
+from nerif.data.volume import FORMATS
 
 __all__ = ["PAGE"]
 

@@ -7,7 +7,8 @@ from html import escape
 import torch
 
 from nerif.app.forms.elements import images_html
-from nerif.data.measurement import Measurement, integrals_of
+from nerif.data.measurement import Measurement
+from nerif.data.measurement_data import integrals_of
 from nerif.geometry import Camera
 from nerif.imaging.masks import MaskSettings, with_flow_masks
 from nerif.report.view_images import image_address

@@ -13,9 +13,10 @@ from nerif.cli.commands.output import counting_bar, say
 from nerif.cli.commands.settings import Settings, command
 from nerif.common.conventions import InputError
 from nerif.common.files import ending
-from nerif.data.exports import FORMATS, PROGRAMS, export, export_frame, export_geometry
+from nerif.data.geometry_export import PROGRAMS, export_geometry
 from nerif.data.measurement import Measurement
-from nerif.data.volume import quantities_of
+from nerif.data.velocity_sequence import export_frame
+from nerif.data.volume import FORMATS, export, quantities_of
 from nerif.geometry import Box, Grid
 from nerif.physics.quantities import GasChanges, derive, masked_lines
 from nerif.results.directory import ResultDirectory

@@ -14,7 +14,7 @@ from nerif.cli.commands.settings import Flat, Settings, command
 from nerif.common.conventions import InputError, with_unit
 from nerif.common.interruption import if_interrupted
 from nerif.common.locks import locked
-from nerif.data.volume_file import write_netcdf
+from nerif.data.volume import write_netcdf
 from nerif.geometry import Ring
 from nerif.simulation.simulate import Simulation
 

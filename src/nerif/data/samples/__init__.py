@@ -10,11 +10,11 @@ from nerif.common.conventions import InputError
 from nerif.common.files import atomic
 from nerif.common.written_files import OwnFiles
 
-__all__ = ["SAMPLES", "Sample", "sample"]
+__all__ = ["SAMPLES", "SampleData", "sample"]
 
 
 @dataclass(frozen=True)
-class Sample:
+class SampleData:
     """A real measurement.
 
     Parameters
@@ -28,11 +28,11 @@ class Sample:
 
 
 SAMPLES = {
-    "jet": Sample("underexpanded supersonic jet with shock cells, one camera, two images", "MIT"),
-    "blowtorch": Sample(
+    "jet": SampleData("underexpanded supersonic jet with shock cells, one camera, two images", "MIT"),
+    "blowtorch": SampleData(
         "hot gas of a blowtorch, slanted and cut by the edge of the image, one camera, two images", "MIT"
     ),
-    "spray": Sample("X-ray absorption of an impinging-jet water spray, one slice, 18 angles", "CC0-1.0"),
+    "spray": SampleData("X-ray absorption of an impinging-jet water spray, one slice, 18 angles", "CC0-1.0"),
 }
 
 

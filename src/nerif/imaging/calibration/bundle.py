@@ -1,4 +1,4 @@
-"""Bundle adjustment: intrinsics, camera poses and target poses from all detected points.
+"""CameraBundle adjustment: intrinsics, camera poses and target poses from all detected points.
 
     minimise  sum rho(|pixel - project_i(R_i (R_j X + t_j) + t_i)|^2),      rho Huber's loss
 
@@ -11,7 +11,7 @@ Each step of the Levenberg-Marquardt method solves the normal equations exactly,
 converge too. Parameters that no image constrains, such as the depth of a telecentric camera, stay at their initial
 value, with standard deviation 0.
 
-Source: Triggs et al., Bundle adjustment - a modern synthesis, 2000.
+Source: Triggs et al., CameraBundle adjustment - a modern synthesis, 2000.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from nerif.geometry import PERSPECTIVE, Projection
 from nerif.geometry.distortion import POWERS, distort, tilt, tilt_slopes
 from nerif.imaging.calibration.targets import Detection
 
-__all__ = ["COEFFICIENTS", "INTRINSIC", "TILT", "Bundle", "Observation", "Pose", "adjust", "crossing"]
+__all__ = ["COEFFICIENTS", "INTRINSIC", "TILT", "CameraBundle", "Pose", "TargetObservation", "adjust", "crossing"]
 
 COEFFICIENTS, TILT = ("k1", "k2", "p1", "p2", "k3"), ("tau_x", "tau_y")
 HUBER = 5  # residual over noise beyond which the loss is linear
@@ -90,7 +90,7 @@ class Pose:
 
 
 @dataclass(frozen=True)
-class Observation:
+class TargetObservation:
     """The target of one image.
 
     Parameters
@@ -108,7 +108,7 @@ class Observation:
 
 
 @dataclass(frozen=True)
-class Bundle:
+class CameraBundle:
     """All cameras and target poses.
 
     Parameters
@@ -130,14 +130,14 @@ class Bundle:
     sizes: tuple[tuple[int, int], ...]
     projection: Projection = PERSPECTIVE
 
-    def project(self, o: Observation) -> Float[np.ndarray, "n 2"]:
+    def project(self, o: TargetObservation) -> Float[np.ndarray, "n 2"]:
         """Return the points of an observation by the model, px."""
         k, pose = self.intrinsics[o.camera], self.cameras[o.camera] @ self.poses[o.pose]
         image = self.projection.image(pose.apply(o.detection.points))
         x, y, _ = tilt(*distort(image[:, 0], image[:, 1], k[4:9])[:2], k[9:])
         return np.stack([k[0] * x + k[2], k[1] * y + k[3]], axis=1)
 
-    def derivatives(self, o: Observation) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def derivatives(self, o: TargetObservation) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the derivatives (2 n, p) of u, v of each point by intrinsics, camera pose and target pose."""
         import cv2
 
@@ -170,18 +170,18 @@ class Bundle:
         by_camera = by_joint @ np.block([[drdb, drdtb], [dtdb, dtdtb]])
         return by_intrinsics, by_camera, by_joint @ np.block([[drda, drdta], [dtda, dtdta]])
 
-    def residual(self, o: Observation) -> Float[np.ndarray, "n 2"]:
+    def residual(self, o: TargetObservation) -> Float[np.ndarray, "n 2"]:
         """Return detected minus projected points, px."""
         return o.detection.pixels - self.project(o)
 
-    def rms(self, o: Observation) -> float:
+    def rms(self, o: TargetObservation) -> float:
         """Return the rms reprojection error of an observation, px."""
         return float(np.sqrt((self.residual(o) ** 2).sum(axis=1).mean()))
 
 
 def adjust(
-    bundle: Bundle, observations: Sequence[Observation], noise: float, iterations: int = 100
-) -> tuple[Bundle, Float[np.ndarray, "camera 17 17"]]:
+    bundle: CameraBundle, observations: Sequence[TargetObservation], noise: float, iterations: int = 100
+) -> tuple[CameraBundle, Float[np.ndarray, "camera 17 17"]]:
     """Return the adjusted bundle, and the covariance of each camera's parameters.
 
     The covariances (11 intrinsics, rotation about the camera's own axes in rad, translation in mm) follow from the
@@ -193,7 +193,7 @@ def adjust(
     """
     from scipy.linalg import cho_factor, cho_solve
 
-    layout = _Layout(bundle, observations, noise)
+    layout = _ParameterOrder(bundle, observations, noise)
     x, damping, stalls = layout.pack(bundle), 1e-3, 0
     cost, curvature, slope = layout.normal_equations(x)
     for _ in range(iterations):
@@ -240,10 +240,10 @@ def _scale(curvature: np.ndarray) -> np.ndarray:
     return np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
 
 
-class _Layout:
+class _ParameterOrder:
     """The order of all parameters in one vector: of each camera its free intrinsics and pose, then the target poses."""
 
-    def __init__(self, bundle: Bundle, observations: Sequence[Observation], noise: float) -> None:
+    def __init__(self, bundle: CameraBundle, observations: Sequence[TargetObservation], noise: float) -> None:
         self.bundle, self.observations, self.noise = bundle, observations, noise
         self.free = np.flatnonzero(bundle.free)
         self.block = len(self.free) + POSE
@@ -251,7 +251,7 @@ class _Layout:
         self.pose_at = {j: len(bundle.cameras) * self.block + POSE * i for i, j in enumerate(others)}
         self.size = len(bundle.cameras) * self.block + POSE * len(others)
 
-    def pack(self, bundle: Bundle) -> np.ndarray:
+    def pack(self, bundle: CameraBundle) -> np.ndarray:
         x = np.empty(self.size)
         for i, camera in enumerate(bundle.cameras):
             x[i * self.block : (i + 1) * self.block] = np.concatenate([bundle.intrinsics[i, self.free], camera.vector])
@@ -259,7 +259,7 @@ class _Layout:
             x[at : at + POSE] = bundle.poses[j].vector
         return x
 
-    def unpack(self, x: np.ndarray) -> Bundle:
+    def unpack(self, x: np.ndarray) -> CameraBundle:
         intrinsics, cameras = self.bundle.intrinsics.copy(), []
         for i in range(len(self.bundle.cameras)):
             block = x[i * self.block : (i + 1) * self.block]
@@ -308,7 +308,7 @@ class _Layout:
             slope[at] += jacobian.T @ prior[i]
         return cost + float((prior**2).sum()), curvature, slope
 
-    def _prior(self, bundle: Bundle) -> np.ndarray:
+    def _prior(self, bundle: CameraBundle) -> np.ndarray:
         """Principal point from the middle of the image, and distortion, over their sigma, times the noise."""
         middle = np.array([((w - 1) / 2, (h - 1) / 2) for h, w in bundle.sizes])
         off = np.concatenate([bundle.intrinsics[:, 2:4] - middle, bundle.intrinsics[:, 4:9]], axis=1)

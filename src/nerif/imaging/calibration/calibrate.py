@@ -18,11 +18,11 @@ from nerif.common.conventions import FACES, InputError
 from nerif.common.files import check_known
 from nerif.common.settings import Positive, check_settings
 from nerif.geometry import PROJECTIONS, Projection, projection_named
-from nerif.imaging.calibration.bundle import COEFFICIENTS, TILT, Bundle, Observation, Pose, adjust, crossing
+from nerif.imaging.calibration.bundle import COEFFICIENTS, TILT, CameraBundle, Pose, TargetObservation, adjust, crossing
 from nerif.imaging.calibration.first_guess import first_guess, mirror
 from nerif.imaging.calibration.result import Calibration
 from nerif.imaging.calibration.target_images import find_targets, pose_names
-from nerif.imaging.calibration.targets import CalibrationTarget, ViewImages
+from nerif.imaging.calibration.targets import CalibrationTarget, TargetDetections
 from nerif.imaging.readers.views import View
 
 __all__ = ["CalibrationSettings", "calibrate", "calibrate_views", "target_images"]
@@ -140,7 +140,7 @@ def target_images(views: Sequence[View]) -> int:
 
 
 def calibrate(
-    views: Sequence[ViewImages],
+    views: Sequence[TargetDetections],
     settings: CalibrationSettings = CalibrationSettings(),
     background_distance: float | None = None,
 ) -> Calibration:
@@ -173,14 +173,14 @@ def calibrate(
     return result
 
 
-def _fits(bundle: Bundle, observations: Sequence[Observation]) -> list[bool]:
+def _fits(bundle: CameraBundle, observations: Sequence[TargetObservation]) -> list[bool]:
     """Which images have an rms of at most 5 times the median of all, or 0.1 px."""
     rms = [bundle.rms(o) for o in observations]
     limit = max(5 * float(np.median(rms)), 0.1)
     return [r <= limit for r in rms]
 
 
-def _check_counts(views: Sequence[ViewImages], consistent: Sequence[Observation]) -> None:
+def _check_counts(views: Sequence[TargetDetections], consistent: Sequence[TargetObservation]) -> None:
     """Refuse a camera of which more than half the images do not fit: then the fault is not in single images."""
     for i, view in enumerate(views):
         count = sum(o.camera == i for o in consistent)
@@ -193,7 +193,7 @@ def _check_counts(views: Sequence[ViewImages], consistent: Sequence[Observation]
             )
 
 
-def _on_side(bundle: Bundle, settings: CalibrationSettings, names: Sequence[str]) -> Bundle:
+def _on_side(bundle: CameraBundle, settings: CalibrationSettings, names: Sequence[str]) -> CameraBundle:
     """The bundle, or its mirror image if only that has the view of `side` on its side."""
     if settings.side is None or bundle.projection.shows_depth:
         return bundle
@@ -211,8 +211,8 @@ def _on_side(bundle: Bundle, settings: CalibrationSettings, names: Sequence[str]
 
 
 def _to_world(
-    bundle: Bundle, covariance: Float[np.ndarray, "camera 17 17"], settings: CalibrationSettings
-) -> tuple[Bundle, Float[np.ndarray, "camera 17 17"]]:
+    bundle: CameraBundle, covariance: Float[np.ndarray, "camera 17 17"], settings: CalibrationSettings
+) -> tuple[CameraBundle, Float[np.ndarray, "camera 17 17"]]:
     """From the frame of the fixed target to the world of the settings; an unconstrained depth is 0 there."""
     move, shows = Pose(settings.rotation, np.array(settings.origin)), np.diag([1, 1, bundle.projection.shows_depth])
     cameras, blocks = [], []

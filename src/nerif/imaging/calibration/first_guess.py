@@ -22,8 +22,8 @@ from jaxtyping import Float
 
 from nerif.common.conventions import InputError
 from nerif.geometry import PERSPECTIVE, TELECENTRIC, Projection
-from nerif.imaging.calibration.bundle import COEFFICIENTS, INTRINSIC, TILT, Bundle, Observation, Pose
-from nerif.imaging.calibration.targets import Detection, ViewImages
+from nerif.imaging.calibration.bundle import COEFFICIENTS, INTRINSIC, TILT, CameraBundle, Pose, TargetObservation
+from nerif.imaging.calibration.targets import Detection, TargetDetections
 
 __all__ = ["first_guess", "mirror"]
 
@@ -38,7 +38,7 @@ FLIP = np.diag([1.0, 1.0, -1.0])
 class Guess(NamedTuple):
     """Initial parameters.
 
-    intrinsics : (camera, 11) as those of a Bundle
+    intrinsics : (camera, 11) as those of a CameraBundle
     cameras : world to camera
     targets : target to world, of the poses that cameras share, by name
     on_background : target to world, of each camera's images of the target on its background, by name
@@ -51,8 +51,9 @@ class Guess(NamedTuple):
 
 
 def first_guess(
-    views: Sequence[ViewImages], coefficients: Sequence[str], world: str = "", projection: Projection = PERSPECTIVE
-) -> tuple[Bundle, list[Observation]]:
+    views: Sequence[TargetDetections], coefficients: Sequence[str], world: str = "",
+    projection: Projection = PERSPECTIVE,
+) -> tuple[CameraBundle, list[TargetObservation]]:  # fmt: skip
     """Return a bundle to adjust, in the frame of one target pose, and all observations.
 
     The principal point of a telecentric camera stays in the middle of the image: shifting it is equivalent to shifting
@@ -76,12 +77,12 @@ def first_guess(
     poses, observations = [guess.targets[n] for n in names], []
     for i, view in enumerate(views):
         for name, detection in view.poses.items():
-            observations.append(Observation(i, names.index(name), detection, name))
+            observations.append(TargetObservation(i, names.index(name), detection, name))
         for name, pose in guess.on_background[i].items():  # each image has its own pose
             poses.append(pose)
-            observations.append(Observation(i, len(poses) - 1, view.background[name], name, on_background=True))
+            observations.append(TargetObservation(i, len(poses) - 1, view.background[name], name, on_background=True))
     principal = projection.shows_depth
-    bundle = Bundle(
+    bundle = CameraBundle(
         intrinsics=guess.intrinsics,
         cameras=guess.cameras,
         poses=tuple(poses),
@@ -93,7 +94,7 @@ def first_guess(
     return bundle, observations
 
 
-def mirror(bundle: Bundle) -> Bundle:
+def mirror(bundle: CameraBundle) -> CameraBundle:
     """Return the rig mirrored at the world's plane z = 0, cameras looking the other way: it takes the same images."""
 
     def flip(pose: Pose) -> Pose:
@@ -105,7 +106,7 @@ def mirror(bundle: Bundle) -> Bundle:
 # -- both projections ----------------------------------------------------------------------------------------------
 
 
-def _check_count(view: ViewImages, images: int) -> None:
+def _check_count(view: TargetDetections, images: int) -> None:
     if images < MIN_IMAGES:
         raise InputError(
             f"expected the target in at least {MIN_IMAGES} images (better 10 or more, tilted in different ways), "
@@ -115,7 +116,7 @@ def _check_count(view: ViewImages, images: int) -> None:
 
 
 def _next_camera(
-    views: Sequence[ViewImages], cameras: Collection[int], targets: Collection[str], minimum: int
+    views: Sequence[TargetDetections], cameras: Collection[int], targets: Collection[str], minimum: int
 ) -> tuple[int, list[str]]:
     """The camera that shares most target poses with those in `cameras`, which see `targets`, and these poses."""
     shared = {i: [n for n in view.poses if n in targets] for i, view in enumerate(views) if i not in cameras}
@@ -150,7 +151,7 @@ Poses = dict[tuple[str, bool], Pose]
 """Target to camera, by name and whether the target is on the background."""
 
 
-def _guess_perspective(views: Sequence[ViewImages], world: str, tilted: bool) -> Guess:
+def _guess_perspective(views: Sequence[TargetDetections], world: str, tilted: bool) -> Guess:
     intrinsics, local = zip(*(_perspective_view(view, tilted) for view in views), strict=True)
     targets = {world: Pose(np.eye(3), np.zeros(3))}
     cameras: dict[int, Pose] = {}
@@ -168,7 +169,7 @@ def _guess_perspective(views: Sequence[ViewImages], world: str, tilted: bool) ->
     )
 
 
-def _perspective_view(view: ViewImages, tilted: bool) -> tuple[np.ndarray, Poses]:
+def _perspective_view(view: TargetDetections, tilted: bool) -> tuple[np.ndarray, Poses]:
     """Intrinsics of one camera, of which only the focal length and a tilt are fitted, and its target poses."""
     import cv2
 
@@ -231,7 +232,7 @@ class _TelecentricView:
     places: Mapping[str, Float[np.ndarray, 2]]
 
 
-def _guess_telecentric(views: Sequence[ViewImages], world: str, _tilted: bool) -> Guess:
+def _guess_telecentric(views: Sequence[TargetDetections], world: str, _tilted: bool) -> Guess:
     """Images of the target on the background are not used, nor is a tilt, which fx and fy describe."""
     local = [_telecentric_view(view) for view in views]
     cameras, targets = _telecentric_rotations(views, local, world)
@@ -244,7 +245,7 @@ def _guess_telecentric(views: Sequence[ViewImages], world: str, _tilted: bool) -
     )
 
 
-def _telecentric_view(view: ViewImages) -> _TelecentricView:
+def _telecentric_view(view: TargetDetections) -> _TelecentricView:
     _check_count(view, len(view.poses))
     affine = {name: _affine(detection) for name, detection in view.poses.items()}
     for name, (matrix, _) in affine.items():
@@ -282,7 +283,7 @@ def _both_rotations(block: Float[np.ndarray, "2 2"]) -> Float[np.ndarray, "2 3 3
 
 
 def _telecentric_rotations(
-    views: Sequence[ViewImages], local: Sequence[_TelecentricView], world: str
+    views: Sequence[TargetDetections], local: Sequence[_TelecentricView], world: str
 ) -> tuple[dict[int, np.ndarray], dict[str, np.ndarray]]:
     """Rotations of cameras (from the world) and targets (to it), beginning with the camera that has most poses."""
     first = max(range(len(views)), key=lambda i: len(views[i].poses))
@@ -343,7 +344,7 @@ def _telecentric_places(
     return {**places, world: np.zeros(3)}, offsets
 
 
-GUESSES: dict[Projection, Callable[[Sequence[ViewImages], str, bool], Guess]] = {
+GUESSES: dict[Projection, Callable[[Sequence[TargetDetections], str, bool], Guess]] = {
     PERSPECTIVE: _guess_perspective,
     TELECENTRIC: _guess_telecentric,
 }

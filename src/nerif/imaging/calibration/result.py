@@ -15,7 +15,7 @@ from nerif.common.conventions import InputError
 from nerif.common.files import read_toml
 from nerif.data.cameras_file import CalibratedCamera, write_cameras
 from nerif.geometry import PERSPECTIVE, Box, Lens, Plane, Projection
-from nerif.imaging.calibration.bundle import INTRINSIC, Bundle, Observation, Pose, crossing
+from nerif.imaging.calibration.bundle import INTRINSIC, CameraBundle, Pose, TargetObservation, crossing
 
 __all__ = ["MOUNT", "Calibration", "FittedPlane", "ImageError", "read_errors", "rms_of"]
 
@@ -97,7 +97,7 @@ class Calibration:
     Parameters
     ----------
     names, sizes : of the cameras and their images (height, width)
-    intrinsics : (camera, 11) as those of a Bundle
+    intrinsics : (camera, 11) as those of a CameraBundle
     poses : world to camera, mm
     errors : one per image
     sigma_rotation, sigma_translation : (camera,) standard deviations from noise alone, degrees and mm; the latter of
@@ -127,8 +127,8 @@ class Calibration:
 
     @classmethod
     def of(
-        cls, names: Sequence[str], bundle: Bundle, covariance: Float[np.ndarray, "camera 17 17"],
-        observations: Sequence[Observation], used: Sequence[bool], background_distance: float | None = None,
+        cls, names: Sequence[str], bundle: CameraBundle, covariance: Float[np.ndarray, "camera 17 17"],
+        observations: Sequence[TargetObservation], used: Sequence[bool], background_distance: float | None = None,
     ) -> Calibration:  # fmt: skip
         """Return the result of an adjusted bundle in the world frame.
 

@@ -74,7 +74,7 @@ class _Markers:
     size: tuple[int, int]
 
 
-class _Layout(NamedTuple):
+class _BoardLayout(NamedTuple):
     """The layout of a board.
 
     rows : number up to the last marker
@@ -224,7 +224,7 @@ def _board_of(markers: _Markers, target: CalibrationTarget) -> CalibrationTarget
     return replace(target, kind="charuco", columns=best.columns, rows=rows, dictionary=dictionary, legacy=legacy)
 
 
-def _layout(markers: _Markers, columns: int, legacy: bool) -> _Layout | None:
+def _layout(markers: _Markers, columns: int, legacy: bool) -> _BoardLayout | None:
     """The layout with this number of columns if a homography maps markers to their squares, upright in them."""
     import cv2
 
@@ -242,7 +242,7 @@ def _layout(markers: _Markers, columns: int, legacy: bool) -> _Layout | None:
     below = np.stack([np.arange(columns), np.full(columns, rows)], axis=-1)[None].astype(np.float64)
     places = cv2.perspectiveTransform(below, np.linalg.inv(homography))[0]
     inside = ((places > 0) & (places < markers.size[::-1])).all(axis=1)
-    return _Layout(columns, rows, legacy, float(fits.mean()), float(inside.mean()) > 0.5)
+    return _BoardLayout(columns, rows, legacy, float(fits.mean()), float(inside.mean()) > 0.5)
 
 
 def _smallest(family: tuple[str, ...], count: int, preferred: str) -> str:

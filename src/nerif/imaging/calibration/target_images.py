@@ -9,7 +9,7 @@ import numpy as np
 
 from nerif.common.conventions import InputError
 from nerif.imaging.calibration.target_diagnosis import explain
-from nerif.imaging.calibration.targets import CalibrationTarget, Detection, ViewImages
+from nerif.imaging.calibration.targets import CalibrationTarget, Detection, TargetDetections
 from nerif.imaging.readers.exposure import full_scale
 from nerif.imaging.readers.frame_numbers import words_of_names
 from nerif.imaging.readers.frames import Frames, read_each
@@ -27,7 +27,7 @@ def find_targets(
     say: Callable[[str], None],
     on_image: Callable[[], None] = lambda: None,
     on_background: CalibrationTarget | None = None,
-) -> ViewImages:
+) -> TargetDetections:
     """Detect the target in all images of a view; report how these are read, and those without a detection.
 
     Where few images have one, it is said why. InputError if none of those in free space has.
@@ -83,7 +83,7 @@ def find_targets(
                 raise InputError(text, field=f"view '{view.name}'")
             diagnosis = text
         say(f"note: view '{view.name}': {text}")
-    return ViewImages(view.name, size, detections["target"], detections["background"], diagnosis)
+    return TargetDetections(view.name, size, detections["target"], detections["background"], diagnosis)
 
 
 def few_detections(count: int, total: int) -> bool:

@@ -17,7 +17,7 @@ __all__ = [
     "KINDS",
     "CalibrationTarget",
     "Detection",
-    "ViewImages",
+    "TargetDetections",
     "eight_bit",
     "marker_parameters",
     "marker_squares",
@@ -53,7 +53,7 @@ class Detection:
 
 
 @dataclass(frozen=True)
-class ViewImages:
+class TargetDetections:
     """Detections in the images of one camera.
 
     Parameters
@@ -70,7 +70,7 @@ class ViewImages:
     background: Mapping[str, Detection]
     diagnosis: str = ""
 
-    def without(self, names: Collection[str]) -> ViewImages:
+    def without(self, names: Collection[str]) -> TargetDetections:
         """Return the detections except those in images of these names, such as cam1/target/7."""
         poses, background = (
             {pose: d for pose, d in detections.items() if f"{self.name}/{source}/{pose}" not in names}

@@ -15,7 +15,7 @@ from nerif.common.conventions import percent
 from nerif.imaging.noise import local_correlation
 from nerif.imaging.quality.thumbnails import TILE, Thumbnail, local_displacement, match, shifted, thumbnails
 from nerif.imaging.readers.exposure import saturated
-from nerif.imaging.readers.views import Images, View
+from nerif.imaging.readers.views import View, ViewFrames
 
 __all__ = ["Outliers", "flow_thumbnail", "outliers", "without_outliers"]
 
@@ -82,7 +82,7 @@ def outliers(
     return Outliers(reasons, note)
 
 
-def without_outliers(view: View, images: Images, say: Callable[[str], None]) -> Images:
+def without_outliers(view: View, images: ViewFrames, say: Callable[[str], None]) -> ViewFrames:
     """Return the reference images of a view that agree with one another; report the others."""
     full = view.full_scale
     small, shares = [], []

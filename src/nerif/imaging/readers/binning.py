@@ -29,12 +29,10 @@ class Binning:
 
     Parameters
     ----------
-    pattern : colours of the first two pixels of the first two rows, such as RGGB
     means : grey values at the places (0, 0), (0, 1), (1, 0), (1, 1) of the cells
     full_scale : grey value of a saturated pixel; a cell with such a pixel is saturated
     """
 
-    pattern: str
     means: tuple[float, ...]
     full_scale: float
 
@@ -72,9 +70,9 @@ def bin_mosaics(sources: Sequence[Frames], mosaic: str = "") -> None:
         if not pattern or min(frames.layout.shape) < 2:
             continue
         alike = [other for other in readable if other.layout.shape == frames.layout.shape]
-        binning = Binning(pattern, frames.layout.means, full_scale(*alike))
+        binning = Binning(frames.layout.means, full_scale(*alike))
         for other in alike:
-            other.binning = binning
+            other.binning, other.mosaic = binning, pattern
         return
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, SupportsIndex
+from typing import SupportsIndex
 
 import numpy as np
 
@@ -20,10 +20,9 @@ from nerif.common.memory import check_memory
 from nerif.common.times import whole_steps
 from nerif.imaging.readers.mosaic import bayer_pattern, phase_means
 
-if TYPE_CHECKING:
-    from nerif.imaging.readers.binning import Binning
-
-__all__ = ["Frames", "Layout", "SelectedFrames", "as_float", "check_count", "check_size", "read_each", "size_in_words"]
+__all__ = [
+    "FrameLayout", "Frames", "SelectedFrames", "as_float", "check_count", "check_size", "read_each", "size_in_words",
+]  # fmt: skip
 
 LUMINANCE = np.array([0.299, 0.587, 0.114])  # of R, G, B (ITU-R BT.601)
 SAMPLE = 5  # frames that determine the layout
@@ -32,7 +31,7 @@ LEAST_STORED = 1e-3  # of the frames of a header; a copy that was interrupted be
 
 
 @dataclass(frozen=True)
-class Layout:
+class FrameLayout:
     """Common properties of most of the sampled frames of a sequence, as they are stored.
 
     Parameters
@@ -69,8 +68,10 @@ class Frames(ABC):
     rows; None if unknown or none."""
     notes: tuple[str, ...] = ()
     """Warnings about the file, each a line that begins with its name."""
-    binning: Binning | None = None
+    binning: Callable[[np.ndarray], np.ndarray] | None = None
     """Binning of the raw mosaic of a colour camera; None for grey frames."""
+    mosaic: str = ""
+    """Its Bayer pattern."""
 
     @abstractmethod
     def __len__(self) -> int: ...
@@ -113,10 +114,10 @@ class Frames(ABC):
         return _grey_frame(image, self.name(i))
 
     @cached_property
-    def layout(self) -> Layout:
+    def layout(self) -> FrameLayout:
         """Size and type of the majority of frames spread over the sequence, so that one bad file does not decide."""
         n = len(self)
-        layouts: list[Layout] = []
+        layouts: list[FrameLayout] = []
         errors: list[InputError] = []
         spread = dict.fromkeys(round(j * (n - 1) / (SAMPLE - 1)) for j in range(SAMPLE))
         for k, i in enumerate(chain(spread, (i for i in range(n) if i not in spread))):
@@ -130,7 +131,7 @@ class Frames(ABC):
             used = int(np.bitwise_or.reduce(image, axis=None)) if image.dtype.kind == "u" else 0
             size = (image.shape[0], image.shape[1])
             peak, means, pattern = float(image.max()), phase_means(image), bayer_pattern(image)
-            layouts.append(Layout(size, image.dtype, self.name(i), peak, used, means, pattern))
+            layouts.append(FrameLayout(size, image.dtype, self.name(i), peak, used, means, pattern))
         if not layouts:
             raise errors[0]
         (majority, _), *_ = Counter((x.shape, x.dtype) for x in layouts).most_common()
@@ -139,7 +140,7 @@ class Frames(ABC):
         means = tuple(np.mean([x.means for x in agreeing], axis=0).tolist())
         patterns = Counter(x.pattern for x in agreeing if x.pattern)
         pattern = patterns.most_common(1)[0][0] if 2 * patterns.total() > len(agreeing) else ""
-        return Layout(*majority, agreeing[0].example, max(x.peak for x in agreeing), used, means, pattern)
+        return FrameLayout(*majority, agreeing[0].example, max(x.peak for x in agreeing), used, means, pattern)
 
     @property
     def shape(self) -> tuple[int, int]:

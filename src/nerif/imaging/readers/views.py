@@ -47,12 +47,22 @@ from nerif.imaging.readers.mosaic import PATTERNS
 from nerif.imaging.readers.open import open_frames, read_mask
 
 __all__ = [
-    "BEFORE", "SOURCES", "VIEWS", "Images", "View", "find_views", "good_images", "paired", "read_sample", "views_file",
-    "words_of_range", "write_crops",
+    "BEFORE",
+    "SOURCES",
+    "VIEWS",
+    "View",
+    "ViewFrames",
+    "find_views",
+    "good_images",
+    "paired",
+    "read_sample",
+    "views_file",
+    "words_of_range",
+    "write_crops",
 ]  # fmt: skip
 
 TOGETHER = (("target", "background"), ("reference", "flow"))
-"""Images that are compared: if one of the two is binned, so is the other."""
+"""ViewFrames that are compared: if one of the two is binned, so is the other."""
 
 CROP = tuple(f.name for f in fields(Crop))
 HEADS = (*(suffix for suffix in SUFFIXES if suffix != ".mraw"), *EXPORTS)
@@ -125,7 +135,7 @@ class View:
         if frames.binning is None:
             return frames.notes
         height, width = frames.shape
-        line = f"{self.sources[source]}: raw Bayer mosaic ({frames.binning.pattern}), binned to {height} x {width} px"
+        line = f"{self.sources[source]}: raw Bayer mosaic ({frames.mosaic}), binned to {height} x {width} px"
         override = "" if self.mosaic else '; mosaic = "none" in views.toml keeps all pixels'
         return *frames.notes, line + override
 
@@ -362,7 +372,7 @@ def write_crops(folder: Path, crops: Mapping[str, Crop]) -> Path:
     return file
 
 
-class Images(Sequence[np.ndarray]):
+class ViewFrames(Sequence[np.ndarray]):
     """Some images of a view, cropped, read on access."""
 
     def __init__(self, view: View, frames: Frames, indices: Sequence[int]) -> None:
@@ -374,10 +384,10 @@ class Images(Sequence[np.ndarray]):
     @overload
     def __getitem__(self, i: int) -> np.ndarray: ...
     @overload
-    def __getitem__(self, i: slice) -> Images: ...
-    def __getitem__(self, i: int | slice) -> np.ndarray | Images:
+    def __getitem__(self, i: slice) -> ViewFrames: ...
+    def __getitem__(self, i: int | slice) -> np.ndarray | ViewFrames:
         if isinstance(i, slice):
-            return Images(self._view, self._frames, self._indices[i])
+            return ViewFrames(self._view, self._frames, self._indices[i])
         index = self._indices[i]
         return self._view.cropped(self._frames[index], self._frames.name(index))
 
@@ -385,9 +395,9 @@ class Images(Sequence[np.ndarray]):
         """Return the name of an image in messages."""
         return self._frames.name(self._indices[i])
 
-    def select(self, numbers: Sequence[int]) -> Images:
+    def select(self, numbers: Sequence[int]) -> ViewFrames:
         """Return the images of these numbers."""
-        return Images(self._view, self._frames, [self._indices[i] for i in numbers])
+        return ViewFrames(self._view, self._frames, [self._indices[i] for i in numbers])
 
 
 def read_sample(view: View, source: str, most: int = 0) -> Iterator[tuple[int, str, np.ndarray | InputError]]:
@@ -403,7 +413,7 @@ def read_sample(view: View, source: str, most: int = 0) -> Iterator[tuple[int, s
             yield i, name, error
 
 
-def good_images(view: View, source: str, say: Callable[[str], None], most: int = 0) -> Images:
+def good_images(view: View, source: str, say: Callable[[str], None], most: int = 0) -> ViewFrames:
     """Return the usable images out of `most` evenly spread ones of a source (0: all); report what is wrong."""
     frames, numbers, errors = view.open(source), [], []
     for note in view.notes(source):
@@ -419,4 +429,4 @@ def good_images(view: View, source: str, say: Callable[[str], None], most: int =
     if not numbers:
         total = f"{len(errors)}" if len(errors) == len(frames) else f"{len(errors)} checked out of {len(frames)}"
         raise InputError(f"none of its {total} {source} images can be used; {errors[0]}", field=f"view '{view.name}'")
-    return Images(view, frames, numbers)
+    return ViewFrames(view, frames, numbers)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from nerif.common.transfer import sent
+from nerif.common.transfer import to_device
 from nerif.fields.network import NeuralField
 from nerif.forward.path_integral import LENS_RAYS
 from nerif.reconstruction.neural.losses import DATA_TERMS, MixedPrecision, loss_terms, reduce
@@ -83,7 +83,7 @@ class Objective:
         """Return the network in full precision less the field where it is known, 0 if ambient; None without a gauge."""
         if self.data.gauge is None:
             return None
-        points, values = (sent(part, self.data.device) for part in self.data.gauge.sample(count, generator))
+        points, values = (to_device(part, self.data.device) for part in self.data.gauge.sample(count, generator))
         return self.field.network(self.field.normalise(points)) - values / self.field.scale
 
     @torch.no_grad()

@@ -15,7 +15,7 @@ import torch.nn.functional as functional
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from nerif.common.transfer import sent
+from nerif.common.transfer import to_device
 from nerif.fields.network import NeuralField
 from nerif.geometry import Rays
 from nerif.reconstruction.neural.losses import Evaluator, MixedPrecision
@@ -92,7 +92,7 @@ def sample_rays(
     else:
         draw = torch.rand(n // rays_per_pixel, 1, generator=generator)
         draw = ((draw + torch.arange(rays_per_pixel) / rays_per_pixel) % 1).reshape(n, 1)
-    share = (torch.arange(count, device=device) + sent(draw, device)) / count
+    share = (torch.arange(count, device=device) + to_device(draw, device)) / count
     length = (rays.far - rays.near)[:, None]
     if sampling != "adaptive" or density is None or density.values is None:
         return rays.near[:, None] + share * length, (length / count).expand(n, count)

@@ -13,8 +13,8 @@ from torch import Tensor
 
 from nerif.common.conventions import InputError
 from nerif.common.files import atomic
-from nerif.data.velocity_sequence import COMPONENTS, VelocitySequence
-from nerif.data.volume import Volume
+from nerif.data.velocity_sequence import VelocitySequence
+from nerif.data.volume import COMPONENTS, Volume
 from nerif.geometry import Box, Grid
 from nerif.imaging.displacement.correlation import correlate
 
