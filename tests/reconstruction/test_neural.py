@@ -21,7 +21,7 @@ from nerif.geometry import Grid, paper_rig
 from nerif.reconstruction import bins
 from nerif.reconstruction.field_files import read_state, write_state
 from nerif.reconstruction.gauge import Gauge
-from nerif.reconstruction.neural import callbacks, objective, trainer
+from nerif.reconstruction.neural import objective, trainer, watch
 from nerif.reconstruction.neural.losses import LossWeights, MixedPrecision, by_differences
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.neural.presets import PRESETS, preset
@@ -128,7 +128,7 @@ def test_a_non_finite_loss_rolls_back_and_in_the_end_stops(measurement, monkeypa
         return {k: v * (float("nan") if bad else 1.0) for k, v in real(*args).items()}
 
     monkeypatch.setattr(objective, "loss_terms", poisoned)
-    monkeypatch.setattr(callbacks, "SAVE_EVERY", 10)
+    monkeypatch.setattr(watch, "SAVE_EVERY", 10)
     result = SMALL(measurement)
     assert bool(torch.isfinite(result.field(torch.rand(30, 3))).all())
     if persistent:
@@ -150,7 +150,7 @@ def test_a_learning_rate_far_too_high_is_lowered(measurement):
 
 def test_a_collapsed_field_is_rolled_back(measurement, monkeypatch):
     """Weights set to 0 in the middle of a good run."""
-    monkeypatch.setattr(callbacks, "SAVE_EVERY", 40)
+    monkeypatch.setattr(watch, "SAVE_EVERY", 40)
     run, steps = trainer.Trainer(replace(SMALL, max_steps=200), TrainingData(SMALL, measurement)), []
 
     def sabotage(step: Step) -> None:

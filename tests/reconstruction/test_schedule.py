@@ -12,7 +12,7 @@ import torch
 from nerif.fields.network import NetworkShape
 from nerif.reconstruction.neural import schedule as module
 from nerif.reconstruction.neural import trainer
-from nerif.reconstruction.neural.callbacks import EMPTY_RATE, EMPTY_STEPS, MIN_STEPS, FitMonitor
+from nerif.reconstruction.neural.fit_monitor import EMPTY_RATE, EMPTY_STEPS, MIN_STEPS, FitMonitor
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.neural.parallel import Ranks
 from nerif.reconstruction.neural.presets import preset

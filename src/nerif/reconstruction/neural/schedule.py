@@ -1,4 +1,4 @@
-"""When a training ends: its limits, convergence on withheld pixels, and collapse to the ambient field.
+"""The course of a training: its limits, its cycles up to convergence, learning rates and bins of pixels.
 
 Cycles. A run without a limit consists of cycles, each twice as long as the one before. Each ends at the smallest
 learning rate, so that the ends can be compared. With e the mean square of the residual over sigma on withheld pixels,
@@ -7,12 +7,6 @@ of which the noise is 1, the run has converged when the last PATIENCE cycles hav
     min e before them - min e of them <= max(FALL (e - 1), SCATTER e)
 
 One cycle is not enough: few pixels are withheld, so e scatters from cycle to cycle.
-
-Collapse. A network that takes too large a step ends at the ambient field, whose gradient is zero. There
-
-    q = |prediction - d|^2 / |d|^2        over the last steps, each over sigma^2
-
-stays at 1.
 """
 
 from __future__ import annotations
@@ -47,11 +41,10 @@ class Resumable:
 
 
 PATIENCE = 2  # cycles
-FALL = (
-    0.08  # of the excess over the noise: a doubling that gains less leaves 5 % of the error (its root) to the next two
-)
+FALL = 0.08  # of the excess over the noise: a doubling that gains less leaves 5 % of its root to the next two
 SCATTER = 0.003  # of e: smaller changes are random
 MAX_CYCLES = 6
+PACE_FROM = 0.1  # share of the run after which its pace is known, for the choice of bins
 
 
 class Cycles(Resumable):
@@ -127,9 +120,11 @@ class Schedule:
     outcome : why the run is over; None before
     rate_factor : of the learning rate, below 1 after a fit to a start and after rolling back
     ray_count : rays of all batches, in bins of any size
+    bins_chosen : whether the smallest bins of pixels that the run can use are known
     """
 
     outcome: Outcome | None = None
+    bins_chosen = False
 
     def __init__(self, settings: TrainingSettings, rays: int, ranks: Ranks, device: torch.device) -> None:
         self.settings, self.rays, self.ranks, self.device = settings, rays, ranks, device
@@ -219,6 +214,18 @@ class Schedule:
         """Rays for which there is still time; inf without a limit of steps or time."""
         share = max(self._shares() if self.cycles is None else [*self._shares(), self.share], default=0.0)
         return self.ray_count * (1 - share) / share if share else math.inf
+
+    def smaller_bins(self, edge: int) -> int:
+        """Return the edge (px) of the smallest bins of which the rest of the run can use all, at most the present one.
+
+        It is chosen once, when the pace is known.
+        """
+        if self.bins_chosen or self.progress < PACE_FROM:
+            return edge
+        self.bins_chosen, rays, remaining = True, self.rays, self.remaining
+        while edge > 1 and 4 * rays <= remaining:
+            edge, rays = edge // 2, 4 * rays
+        return edge
 
     def limit(self) -> Outcome | None:
         """Return the limit that is reached, if any."""

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from contextlib import suppress
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -22,6 +23,7 @@ from nerif.data.measurement import Measurement
 from nerif.fields.network import NeuralField
 from nerif.fields.network_kinds import network_in
 from nerif.forward.forward_model import ForwardModel
+from nerif.forward.path_integral import PathIntegral, project
 from nerif.reconstruction.aperture import apply_aperture, lens_rays
 from nerif.reconstruction.bins import coarsest_edge, withhold_pixels
 from nerif.reconstruction.bounds import field_bounds, in_units
@@ -39,7 +41,7 @@ __all__ = ["TrainingData", "shuffled"]
 
 ROUNDS = 6
 MULTIPLIER = 0x9E3779B1  # 2^32 / golden ratio, odd
-NUISANCE_PIXELS = 1024  # per view
+NUISANCE_PIXELS, NUISANCE_SAMPLES = 1024, 24  # per view; per ray
 
 
 def shuffled(first: int, length: int, count: int, seed: int) -> Int[Tensor, " n"]:
@@ -191,13 +193,17 @@ class TrainingData:
 
     # -- nuisance parameters: fitted besides the field, such as the brightness of images -------------------------------
 
-    @property
-    def nuisance_parts(self) -> list[Part]:
-        """Random pixels to which nuisance parameters are fitted."""
+    @torch.no_grad()
+    def fit_nuisance(self, field: NeuralField) -> None:
+        """Fit nuisance parameters to a field, at random pixels."""
         generator = torch.Generator().manual_seed(self.stage)
-        parts = [part for part in self.target.parts if part.model.settles]
-        index = [torch.randperm(len(part), generator=generator)[: NUISANCE_PIXELS * len(self.names)] for part in parts]
-        return [self.with_rig(part[i.to(self.device)]) for part, i in zip(parts, index, strict=True)]
+        for part in self.target.parts:
+            if part.model.settles:
+                index = torch.randperm(len(part), generator=generator)[: NUISANCE_PIXELS * len(self.names)]
+                pixels = self.with_rig(part[index.to(self.device)])
+                rays = replace(pixels.rays, lens=None)
+                integral = project(PathIntegral(pixels.model.integral, NUISANCE_SAMPLES), field, rays, self.device)
+                pixels.model.settle(integral, pixels.measured, pixels.inverse_scale, rays)
 
     def copy_nuisance(self) -> None:
         """Give withheld pixels the nuisance parameters of the others."""
@@ -210,11 +216,12 @@ class TrainingData:
         nuisance = {str(i): model.brightness.clone() for i, model in enumerate(_nuisance_models(self.target))}
         return nuisance | rig_state(self.refinement)
 
-    def load_state_dict(self, stage: int, state: dict[str, Tensor]) -> None:
-        """Continue in a stage with the nuisance parameters and the rig of a checkpoint."""
-        if stage != self.stage:
+    def load_state_dict(self, stage: int, state: dict[str, Tensor], edge: int | None = None) -> None:
+        """Continue in a stage, with bins of an edge (px), with the nuisance parameters and the rig of a checkpoint."""
+        edge = self.edge if edge is None else edge
+        if (stage, edge) != (self.stage, self.edge):
             self.stage = stage
-            self.set_bins(self.edge)
+            self.set_bins(edge)
         for i, model in enumerate(_nuisance_models(self.target)):
             model.adopt(state[str(i)])
         load_rig(self.refinement, state)
