@@ -11,7 +11,7 @@ import xarray
 
 from nerif.geometry import Ring
 from nerif.reconstruction.neural.neural import NeRIF
-from nerif.reconstruction.neural.sampling import Batch, Piece
+from nerif.reconstruction.neural.sampling import Batch, RayBatch
 from nerif.reconstruction.neural.trainer import Trainer
 from nerif.reconstruction.neural.training_data import TrainingData
 from nerif.simulation.simulate import simulate
@@ -50,7 +50,7 @@ def test_one_page_has_the_loss_and_gradient_of_the_package(tmp_path, ball, box) 
     ours = page.loss(field, batch, s, interval, ambient, size)
     ours.backward()
 
-    piece = Piece(part, part.rays, s, interval, part.measured.numel())
+    piece = RayBatch(part, part.rays, s, interval, part.measured.numel())
     training.objective.gauge_errors = lambda count, _: theirs.network(theirs.normalise(ambient))  # the same points
     loss, _ = training.objective(Batch([piece], piece.numbers))
     loss.backward()

@@ -61,7 +61,7 @@ class Other(SharedSettings):
         method = Tikhonov(voxels=8, iterations=3 if self.gait == "slow" else 6, regularisation=1e-3)
         return method(measurement, on_step, resume, start)
 
-    def in_two(self) -> tuple[Other, Other]:
+    def split_for_cross_validation(self) -> tuple[Other, Other]:
         return self, self
 
 

@@ -12,7 +12,7 @@ from axisymmetric_plume import GRAVITY, HEIGHT, KAPPA, NU, RADIUS, Plume, plume
 from nerif.flow.assimilation import VelocityFit
 from nerif.flow.axisymmetric_box import AxisymmetricBox
 from nerif.flow.boussinesq import Boussinesq
-from nerif.flow.box_domain import MeridionalPlane, Space, section_of
+from nerif.flow.box_domain import BoxDomain, MeridionalPlane, section_of
 from nerif.flow.transport import Transport
 from nerif.geometry import Box, Grid
 from nerif.geometry.symmetry import Symmetry
@@ -203,5 +203,5 @@ def test_only_axisymmetric_flows_have_a_plane():
     film = Grid(Box.cube(40.0), (20, 20, 20))
     for name in ("planar", "axis+1"):
         symmetry = Symmetry.about(name, (0, 0, 0), (0, 0, 1), 1e-3)
-        assert type(section_of(film, symmetry)) is Space
-    assert type(section_of(film, None)) is Space
+        assert type(section_of(film, symmetry)) is BoxDomain
+    assert type(section_of(film, None)) is BoxDomain

@@ -15,7 +15,7 @@ from nerif.flow.low_mach import LowMach
 from nerif.flow.periodic_box import PeriodicBox
 from nerif.flow.transport import Transport
 from nerif.flow.velocity_deviations import deviations_of
-from nerif.flow.velocity_problem import Problem, noise_of, resampled
+from nerif.flow.velocity_problem import VelocityProblem, noise_of, resampled
 from nerif.geometry import Box, Grid
 from refusals import refused
 
@@ -241,7 +241,7 @@ def test_the_misfit_of_noise_is_1_at_the_true_velocity(kind: str):
 
 def test_forces_that_stand_for_the_flow_outside_are_no_lack_of_momentum():
     theta, times = puffs(3), [STEP * k for k in range(3)]
-    problem = Problem(VelocityFit(resolution=8), theta, PUFF, times, PeriodicBox(Grid(PUFF.box, (9, 7, 8))))
+    problem = VelocityProblem(VelocityFit(resolution=8), theta, PUFF, times, PeriodicBox(Grid(PUFF.box, (9, 7, 8))))
     controls = torch.randn(3, 3, *problem.box.shape, generator=torch.Generator().manual_seed(0))
     margins = problem.box.margins()
     inside, outside = (problem.flow(controls * part).momentum for part in (1 - margins, margins))
@@ -254,10 +254,10 @@ def test_samples_have_the_weights_of_their_centre(monkeypatch: pytest.MonkeyPatc
     theta, times = puffs(1).expand(5, -1, -1, -1), [STEP * k for k in range(5)]  # at rest, with noise where it is
     theta = theta + 0.1 * theta * torch.randn(theta.shape, generator=torch.Generator().manual_seed(3))
     settings = VelocityFit(physics="transport", resolution=8)
-    problem = Problem(settings, theta, PUFF, times, PeriodicBox(Grid(PUFF.box, (9, 7, 8))))
+    problem = VelocityProblem(settings, theta, PUFF, times, PeriodicBox(Grid(PUFF.box, (9, 7, 8))))
     weights = []
 
-    def recorded(problem: Problem, controls: torch.Tensor, *_: object) -> tuple[torch.Tensor, int]:
+    def recorded(problem: VelocityProblem, controls: torch.Tensor, *_: object) -> tuple[torch.Tensor, int]:
         weights.append(problem.transport.deviation)
         return controls, 0
 

@@ -26,7 +26,7 @@ from nerif.reconstruction.neural.losses import LossWeights, MixedPrecision
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.neural.objective import Objective
 from nerif.reconstruction.neural.parallel import Ranks
-from nerif.reconstruction.neural.sampling import Draw, Sampler
+from nerif.reconstruction.neural.sampling import PixelSampling, Sampler
 from nerif.reconstruction.neural.training_data import TrainingData
 from nerif.reconstruction.voxels.operator import VoxelOperator, rays_through
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
@@ -198,7 +198,7 @@ def test_loss_terms_and_gradients_are_finite_if_rays_of_a_pixel_miss_the_box(wid
     torch.manual_seed(0)
     field, generator = data.initial_field(), torch.Generator().manual_seed(0)
     network = MixedPrecision(field.network, data.device, "float32", "off")
-    batch = Sampler(settings, data, field, network, generator, Ranks()).of(torch.arange(len(data)), Draw(4, 4))
+    batch = Sampler(settings, data, field, network, generator, Ranks()).of(torch.arange(len(data)), PixelSampling(4, 4))
     assert not bool(batch.pieces[0].rays.crosses.all())
     for name, term in Objective(settings, data, field, network, generator).terms(batch).items():
         slopes = torch.autograd.grad(term, list(field.network.parameters()), retain_graph=True, allow_unused=True)

@@ -17,7 +17,7 @@ from nerif.fields.turbulence import TurbulentPlume
 from nerif.fields.voxel_field import VoxelField
 from nerif.forward.absorption import Absorption
 from nerif.geometry import Box, Grid, Ring, paper_rig
-from nerif.reconstruction.detail.detail import COARSE, SIGNIFICANT, Choice, Detail, choose, voxels_of
+from nerif.reconstruction.detail.detail import COARSE, SIGNIFICANT, Detail, DetailChoice, choose, voxels_of
 from nerif.reconstruction.detail.gaussian_process import GaussianProcess
 from nerif.reconstruction.gauge import visual_hull
 from nerif.reconstruction.neural.neural import NeRIF
@@ -64,7 +64,7 @@ def posterior(plume):
     truth, measurement = plume
     base = smoothed(truth, 1.5)
     details = [Detail(base, measurement, SETTINGS, coarse=size) for size in (1, COARSE)]
-    return Choice(passes=1).solve(*details)
+    return DetailChoice(passes=1).solve(*details)
 
 
 @pytest.mark.slow
@@ -151,7 +151,7 @@ def test_data_that_err_by_more_than_sigma_are_not_fitted_down_to_it(plume):
 def test_a_solution_is_stopped(plume):
     truth, measurement = plume
     coarse, fine = (Detail(smoothed(truth, 1.5), measurement, SETTINGS, coarse=size) for size in (COARSE, 1))
-    stopped = Choice(passes=1).solve(fine, coarse, lambda posterior: True)
+    stopped = DetailChoice(passes=1).solve(fine, coarse, lambda posterior: True)
     assert (stopped.count, stopped.problem.ratio) == (1, 1.0)
 
 
@@ -258,7 +258,7 @@ def test_the_gaussian_process_stops_on_request_and_at_its_limit(plume):
     limited = replace(small, time_limit=1e-3)(measurement)
     assert limited.outcome.reason == "time_limit"
     assert math.isfinite(float(limited.field.sample(GRID).sum()))
-    short, whole = small.in_two()
+    short, whole = small.split_for_cross_validation()
     assert (short.voxels, whole) == (20, small)
 
 
@@ -267,6 +267,6 @@ def test_total_variation_leaves_detail_too(plume):
     assert isinstance(measurement, Measurement)
     result = TotalVariation(voxels=24, device="cpu")(measurement)
     details = [Detail(result.field, measurement, TotalVariation(device="cpu"), coarse=size) for size in (1, COARSE)]
-    posterior = Choice().solve(*details)
+    posterior = DetailChoice().solve(*details)
     assert posterior.residual < 0.7 * details[0].residual
     assert error(posterior.field, truth) < error(result.field, truth)

@@ -19,7 +19,7 @@ from nerif.reconstruction.neural.losses import LossWeights, MixedPrecision
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.neural.objective import Objective
 from nerif.reconstruction.neural.parallel import Ranks
-from nerif.reconstruction.neural.sampling import Draw, Sampler
+from nerif.reconstruction.neural.sampling import PixelSampling, Sampler
 from nerif.reconstruction.neural.training_data import TrainingData
 
 SMALL = [
@@ -83,7 +83,7 @@ def test_a_process_without_a_ray_of_a_technique_has_the_same_terms_with_weight_0
     def of(ranks: Ranks) -> tuple[dict[str, float], set[str], float]:
         generator = torch.Generator().manual_seed(1)
         batch = Sampler(settings, data, field, network, generator, ranks).of(
-            torch.tensor([0, len(data) - 1]), Draw(1, 8)
+            torch.tensor([0, len(data) - 1]), PixelSampling(1, 8)
         )
         objective = Objective(settings, data, field, network, generator)
         terms = objective.terms(batch)

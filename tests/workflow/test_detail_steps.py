@@ -11,7 +11,7 @@ from nerif.cli.cli import main
 from nerif.fields.sum import SumField
 from nerif.fields.turbulence import TurbulentPlume
 from nerif.geometry import Box, Ring
-from nerif.reconstruction.detail.detail import Choice
+from nerif.reconstruction.detail.detail import DetailChoice
 from nerif.reconstruction.progress import Monitor
 from nerif.reconstruction.voxels.total_variation import TotalVariation
 from nerif.results.directory import ResultDirectory
@@ -102,7 +102,7 @@ def test_an_interruption_loses_nothing_of_the_fit(turbulence, tmp_path, monkeypa
 
     run, out = Run(report=False, withhold=("none",), detail="on"), ResultDirectory(tmp_path / "r")
     with monkeypatch.context() as patch:
-        patch.setattr(Choice, "solve", interrupt)
+        patch.setattr(DetailChoice, "solve", interrupt)
         with pytest.raises((KeyboardInterrupt, SystemExit)):
             reconstruct_into(out.path, turbulence, METHOD, run)
     points = torch.rand(40, 3) * 20 - 10
@@ -153,4 +153,4 @@ def test_the_commands_take_a_result_with_detail(made, turbulence, tmp_path):
 def test_training_comes_first_after_a_first_run_that_explains_little(rms, blurred, most):
     scores = {"fitted_views": [{"rms": rms, "rms_measured": 1.0}]}
     job = SimpleNamespace(validation=SimpleNamespace(scores=lambda: scores))
-    assert share(job, Choice(blurred=blurred)) == most
+    assert share(job, DetailChoice(blurred=blurred)) == most

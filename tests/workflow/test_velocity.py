@@ -17,7 +17,7 @@ from nerif.data.velocity_sequence import VelocitySequence
 from nerif.data.volume import Volume
 from nerif.data.volume_sequence import VolumeSequence
 from nerif.data.vti import read_vti
-from nerif.flow.assimilation import Iterate, VelocityFit
+from nerif.flow.assimilation import FitIterate, VelocityFit
 from nerif.geometry import Box, Grid
 from nerif.geometry.symmetry import Symmetry
 from nerif.report import velocity_page
@@ -148,7 +148,7 @@ def test_an_interrupted_run_continues_from_its_checkpoint(film: Path, tmp_path: 
     monkeypatch.setattr("nerif.workflow.film_velocity.CHECKPOINT_INTERVAL", 0.0)
     settings, out = VelocityFit(resolution=12, max_iterations=12, time_limit=0, samples=0), tmp_path / "v.zarr"
 
-    def stop(iterate: Iterate) -> None:
+    def stop(iterate: FitIterate) -> None:
         if iterate.iterations == 3:
             with refused(out) as another:
                 velocity_of_film(film, out, settings)
@@ -186,7 +186,7 @@ def test_a_symmetric_film_is_solved_in_the_plane_of_its_axis(tmp_path: Path, mon
         store.write(k, [Volume.of((1 - N_AMBIENT) * theta, GRID, "index_excess", N_AMBIENT)])
     settings, out = VelocityFit(resolution=24, max_iterations=20, time_limit=0, samples=2), tmp_path / "v.zarr"
 
-    def stop(iterate: Iterate) -> None:
+    def stop(iterate: FitIterate) -> None:
         if iterate.iterations == 8:
             raise KeyboardInterrupt
 

@@ -17,15 +17,13 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated, Literal, Protocol
+from typing import Protocol
 
 import torch
-from annotated_types import Ge, Gt, Lt
 from jaxtyping import Float
 from torch import Tensor
 
 from nerif.common.conventions import InputError
-from nerif.common.settings import Count, Positive, check_settings
 from nerif.data.measurement_sequence import check_instants
 from nerif.flow.flow import Flow
 from nerif.flow.frame_resampling import laplacian, smooth, squared_slope
@@ -33,12 +31,12 @@ from nerif.flow.low_mach import LARGEST
 from nerif.flow.periodic_box import PeriodicBox
 from nerif.flow.transport import Transport
 from nerif.flow.velocity_deviations import deviations_of
-from nerif.flow.velocity_problem import Problem, minimise, resampled
+from nerif.flow.velocity_problem import VelocityProblem, minimise, resampled
+from nerif.flow.velocity_settings import MIN_VOXELS, VelocitySettings
 from nerif.geometry import Grid
 
-__all__ = ["PHYSICS", "Improvement", "Iterate", "State", "VelocityFit"]
+__all__ = ["FitIterate", "FitState", "Improvement", "VelocityFit"]
 
-PHYSICS = ("boussinesq", "low-mach", "transport")
 LARGEST_DENSITY_CHANGE = {"boussinesq": 0.3, "low-mach": LARGEST}  # of averages over SMOOTH voxels
 SMOOTH = (1.2, 1.2, 1.2)
 STAGES = ((0.67, 0.1), (1.0, 0.8))
@@ -47,7 +45,6 @@ REPEATED_STAGES = ((0.67, 0.08), (0.67, 0.22), (1.0, 0.48), (1.0, 0.8))
 """The same where the density is improved between stages, or the noise estimated from a velocity on the same grid."""
 SPREAD = 1.0  # change of the density by diffusion between two frames, relative to it
 FASTEST = 1.5e5  # mm/s
-MIN_VOXELS = 8  # along the longest edge of the velocity
 ENOUGH = 0.7  # rms of residual / sigma (1 at the true velocity) at which a stage ends: half of the noise is fitted
 IMPROVEMENT = 0.4  # of the time left to a stage, for better densities before it
 SAMPLED = 0.5  # voxels along an edge of the grid of standard deviations, relative to the finest
@@ -62,7 +59,7 @@ class Improvement(Protocol):
 
 
 @dataclass(frozen=True)
-class State:
+class FitState:
     """Where a fit is: its stage, the controls, theta if it was improved, iterations and seconds so far."""
 
     stage: int = 0
@@ -73,7 +70,7 @@ class State:
 
 
 @dataclass(frozen=True)
-class Iterate:
+class FitIterate:
     """Figures of an iteration.
 
     Parameters
@@ -94,41 +91,13 @@ class Iterate:
 
 
 @dataclass(frozen=True)
-class VelocityFit:
-    """Settings of the velocity of a film; called with densities, returns the Flow."""
-
-    physics: Literal[*PHYSICS] = "boussinesq"  # type: ignore[valid-type]
-    """Equations: boussinesq (nearly uniform density), low-mach (hot gas), or transport (no equation of momentum)."""
-    viscosity: Positive = 15.0
-    """Kinematic viscosity, mm^2/s."""
-    diffusivity: Positive = 20.0
-    """Diffusivity of density (heat or species), mm^2/s."""
-    gravity: tuple[float, float, float] = (0.0, 0.0, -9810.0)
-    """Acceleration of gravity along x, y, z, mm/s^2."""
-    resolution: Annotated[int, Ge(MIN_VOXELS)] = 30
-    """Voxels of the velocity along the longest edge of the box."""
-    time_limit: Annotated[float, Ge(0)] = 600.0
-    """Limit on the duration, s (0: none)."""
-    max_iterations: Count = 300
-    """Iterations of each stage at most."""
-    density_noise: Annotated[float, Ge(0), Lt(math.inf)] = 0.0
-    """Standard deviation of density / reference density, averaged over a voxel of the velocity (0: from the film)."""
-    forcing: Annotated[float, Gt(0), Lt(1)] = 0.05
-    """Change of vorticity per interval that the equations do not explain, relative to its largest value."""
-    correlation: Positive = 20.0
-    """Wavelength below which the vorticity is expected to be smaller, mm."""
-    samples: Annotated[int, Ge(0)] = 6
-    """Samples of the flow, from which standard deviations are computed (0: none)."""
-    sample_iterations: Count = 40
-    """Iterations of each sample."""
-
-    def __post_init__(self) -> None:
-        check_settings(self)
+class VelocityFit(VelocitySettings):
+    """Velocity of a film: called with densities, returns the Flow."""
 
     def __call__(
         self, theta: Float[Tensor, "t z y x"], grid: Grid, times: Sequence[float],
-        on_iterate: Callable[[Iterate, State], None] = lambda iterate, state: None, resume: State | None = None,
-        improve: Improvement | None = None, box_of: type[PeriodicBox] = PeriodicBox,
+        on_iterate: Callable[[FitIterate, FitState], None] = lambda iterate, state: None,
+        resume: FitState | None = None, improve: Improvement | None = None, box_of: type[PeriodicBox] = PeriodicBox,
     ) -> Flow:  # fmt: skip
         """Return velocity and pressure of a film.
 
@@ -145,19 +114,19 @@ class VelocityFit:
         theta = theta.float()
         self.check(theta, grid, times, box_of)
         stages = STAGES if improve is None and box_of is PeriodicBox else REPEATED_STAGES
-        state = resume or State()
+        state = resume or FitState()
         first, begin = state.stage, time.monotonic() - state.seconds
         limit = self.time_limit or math.inf
 
-        def report(what: str, misfit: float, state: State) -> float:
+        def report(what: str, misfit: float, state: FitState) -> float:
             seconds = time.monotonic() - begin
             state = replace(state, seconds=seconds)
-            on_iterate(Iterate(what, state.stage, len(stages), state.iterations, seconds, misfit), state)
+            on_iterate(FitIterate(what, state.stage, len(stages), state.iterations, seconds, misfit), state)
             return seconds
 
         first_box = box_of(self._grid(grid, stages[0][0], box_of))
-        common = Problem(self, theta, grid, times, first_box).common_velocity()
-        problem: Problem | None = None
+        common = VelocityProblem(self, theta, grid, times, first_box).common_velocity()
+        problem: VelocityProblem | None = None
         falling = True
         for stage in range(first, len(stages)):
             share, end = stages[stage]
@@ -165,14 +134,14 @@ class VelocityFit:
                 spent = time.monotonic() - begin
                 latest = spent + IMPROVEMENT * (end * limit - spent)
 
-                def improved(iteration: int, misfit: float, state: State = state, latest: float = latest) -> bool:
+                def improved(iteration: int, misfit: float, state: FitState = state, latest: float = latest) -> bool:
                     return report("density", misfit, state) > latest
 
                 with torch.no_grad():
                     splines = problem.splines(problem.spectra(_controls(state)))
                 state = replace(state, theta=improve(problem.transport, splines, improved))
             before, density = problem, theta if state.theta is None else state.theta
-            problem = Problem(self, density, grid, times, box_of(self._grid(grid, share, box_of)), common)
+            problem = VelocityProblem(self, density, grid, times, box_of(self._grid(grid, share, box_of)), common)
             if state.controls is None:
                 controls = problem.prior.start()
             else:
@@ -180,7 +149,7 @@ class VelocityFit:
                 problem.weigh(controls)
             state = replace(state, stage=stage, controls=controls)
 
-            def progress(misfit: float, best: Tensor, done: int, state: State = state) -> float:
+            def progress(misfit: float, best: Tensor, done: int, state: FitState = state) -> float:
                 return report("velocity", misfit, replace(state, controls=best, iterations=done))
 
             controls, done, falling = minimise(
@@ -191,7 +160,7 @@ class VelocityFit:
         flow = problem.flow(_controls(state), falling)
         deviations = None
         if self.samples:
-            coarse = Problem(self, density, grid, times, box_of(self._grid(grid, SAMPLED, box_of)), common)
+            coarse = VelocityProblem(self, density, grid, times, box_of(self._grid(grid, SAMPLED, box_of)), common)
             around = resampled(_controls(state), problem.box, coarse.box)
             deviations = deviations_of(
                 coarse, around, self.samples, self.sample_iterations,
@@ -266,6 +235,6 @@ class VelocityFit:
         return Grid(grid.box, (nz, ny, nx))
 
 
-def _controls(state: State) -> Tensor:
+def _controls(state: FitState) -> Tensor:
     assert state.controls is not None
     return state.controls

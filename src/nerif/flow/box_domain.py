@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TypeVar
 
 import torch
 from jaxtyping import Bool, Float
@@ -18,19 +18,19 @@ from nerif.common.conventions import FACES, InputError
 from nerif.fields.voxel_field import VoxelField
 from nerif.flow.axisymmetric_box import AxisymmetricBox
 from nerif.flow.periodic_box import PeriodicBox
+from nerif.flow.velocity_settings import VelocitySettings
 from nerif.geometry import Box, Grid
 from nerif.geometry.symmetry import Symmetry
 
-if TYPE_CHECKING:
-    from nerif.flow.assimilation import VelocityFit
-
-__all__ = ["MeridionalPlane", "Space", "section_of"]
+__all__ = ["BoxDomain", "MeridionalPlane", "section_of"]
 
 AZIMUTHS = 8  # over which densities are averaged
+AnySettings = TypeVar("AnySettings", bound=VelocitySettings)
+
 LARGEST_LEAN = 10.0  # degrees between the axis and gravity
 
 
-class Space:
+class BoxDomain:
     """The whole box of a film."""
 
     box: type[PeriodicBox] = PeriodicBox
@@ -39,7 +39,7 @@ class Space:
     def __init__(self, film: Grid) -> None:
         self.film = self.grid = film
 
-    def settings(self, settings: VelocityFit) -> VelocityFit:
+    def settings(self, settings: AnySettings) -> AnySettings:
         """Return settings in the coordinates of the section."""
         return settings
 
@@ -65,7 +65,7 @@ class Space:
         return torch.nn.functional.interpolate(values.float()[None, None], size, mode="nearest-exact")[0, 0] > 0.5
 
 
-class MeridionalPlane(Space):
+class MeridionalPlane(BoxDomain):
     """The plane through an axis of symmetry: x the distance from the axis, of either sign, z along it.
 
     It extends to the nearest face around the point of the axis, and as far as the axis itself is in the box. Values in
@@ -83,7 +83,7 @@ class MeridionalPlane(Space):
         box = Box((-radius, -0.5 * size, low), (radius, 0.5 * size, high))
         self.grid = Grid(box, (max(1, round((high - low) / size)), 1, 2 * max(1, round(radius / size))))
 
-    def settings(self, settings: VelocityFit) -> VelocityFit:
+    def settings(self, settings: AnySettings) -> AnySettings:
         gravity, axis = (torch.tensor(v, dtype=torch.float64) for v in (settings.gravity, self.symmetry.direction))
         along, size = float(gravity @ axis), float(gravity.norm())
         lean = math.degrees(math.acos(min(1.0, abs(along) / size))) if size > 0 else 0.0
@@ -159,8 +159,8 @@ class MeridionalPlane(Space):
         return radial.movedim(-1, 0).float(), frame[2].float()[:, None, None, None]
 
 
-def section_of(film: Grid, symmetry: Symmetry | None) -> Space:
+def section_of(film: Grid, symmetry: Symmetry | None) -> BoxDomain:
     """Return the plane of an axisymmetric flow, the whole box of others."""
     if symmetry is not None and symmetry.axial and symmetry.harmonics == 0:
         return MeridionalPlane(film, symmetry)
-    return Space(film)
+    return BoxDomain(film)

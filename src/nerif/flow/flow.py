@@ -9,11 +9,11 @@ from torch import Tensor
 
 from nerif.geometry import Grid
 
-__all__ = ["Deviations", "Flow"]
+__all__ = ["Flow", "FlowDeviations"]
 
 
 @dataclass(frozen=True)
-class Deviations:
+class FlowDeviations:
     """Standard deviations of velocity and pressure, on a grid of their own.
 
     Parameters
@@ -57,7 +57,7 @@ class Flow:
     misfit: float
     unexplained: float | None = None
     theta: Float[Tensor, "t z y x"] | None = None
-    deviations: Deviations | None = None
+    deviations: FlowDeviations | None = None
     falling: bool = False
     iterations: int = 0
     seconds: float = 0.0

@@ -14,9 +14,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerif.flow.flow import Deviations
+from nerif.flow.flow import FlowDeviations
 from nerif.flow.frame_resampling import smooth
-from nerif.flow.velocity_problem import Problem, minimise
+from nerif.flow.velocity_problem import VelocityProblem, minimise
 
 __all__ = ["deviations_of"]
 
@@ -24,9 +24,9 @@ WIDTHS = (1.5, 1.5, 1.5)  # voxels over which variances of few samples are avera
 
 
 def deviations_of(
-    problem: Problem, controls: Float[Tensor, "t 3 z y x"], samples: int, iterations: int,
+    problem: VelocityProblem, controls: Float[Tensor, "t 3 z y x"], samples: int, iterations: int,
     report: Callable[[float], float], limit: float = math.inf,
-) -> Deviations | None:  # fmt: skip
+) -> FlowDeviations | None:  # fmt: skip
     """Return standard deviations about the velocity of given controls; None if the limit left no time for two samples.
 
     Parameters
@@ -63,7 +63,7 @@ def deviations_of(
             pressure += (flow.pressure - mean.pressure).square()
     if count < min(2, samples):
         return None
-    return Deviations(
+    return FlowDeviations(
         mean.grid, smooth(velocity / count, WIDTHS).clamp_min(0).sqrt(),
         None if pressure is None else smooth(pressure / count, WIDTHS).clamp_min(0).sqrt(),
     )  # fmt: skip

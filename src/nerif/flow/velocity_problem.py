@@ -7,7 +7,6 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import torch
 from jaxtyping import Float
@@ -29,12 +28,10 @@ from nerif.flow.periodic_box import PeriodicBox
 from nerif.flow.transport import Transport
 from nerif.flow.uniform_velocity import common_velocity
 from nerif.flow.velocity_prior import VorticityPrior
+from nerif.flow.velocity_settings import VelocitySettings
 from nerif.geometry import Grid
 
-if TYPE_CHECKING:
-    from nerif.flow.assimilation import VelocityFit
-
-__all__ = ["Problem", "Sample", "minimise", "resampled"]
+__all__ = ["NoiseSample", "VelocityProblem", "minimise", "resampled"]
 
 HISTORY = 60  # steps that L-BFGS remembers
 CALM = (2.0, 2.0, 2.0)  # voxels of the velocity over which the scalar is compared
@@ -45,7 +42,7 @@ GAINS = 2.0  # vorticity, relative to that of a flow which changes the density a
 
 
 @dataclass(frozen=True)
-class Sample:
+class NoiseSample:
     """Noise of residual / sigma, and white controls."""
 
     residual: Float[Tensor, "k z y x"]
@@ -56,11 +53,11 @@ class _End(Exception):
     """A limit is reached."""
 
 
-class Problem:
+class VelocityProblem:
     """The fit on one grid; the mean velocity is free, about `common` (mm/s), if that is not 0."""
 
     def __init__(
-        self, settings: VelocityFit, theta: Tensor, grid: Grid, times: Sequence[float], box: PeriodicBox,
+        self, settings: VelocitySettings, theta: Tensor, grid: Grid, times: Sequence[float], box: PeriodicBox,
         common: Float[Tensor, 3] | None = None,
     ) -> None:  # fmt: skip
         self.settings, self.box = settings, box
@@ -111,7 +108,7 @@ class Problem:
         """Return the coefficients of velocities at all instants."""
         return torch.stack([self.box.spline(v) for v in velocities])
 
-    def loss(self, controls: Tensor, noise: Sample | None = None) -> tuple[Tensor, float]:
+    def loss(self, controls: Tensor, noise: NoiseSample | None = None) -> tuple[Tensor, float]:
         """Return the objective, and the rms of residual / sigma where much of the scalar is.
 
         Parameters
@@ -124,11 +121,11 @@ class Problem:
             residual, controls = residual - noise.residual, controls - noise.controls
         return 0.5 * residual.square().sum() + 0.5 * controls.square().sum(), misfit
 
-    def sample(self, generator: torch.Generator) -> Sample:
+    def sample(self, generator: torch.Generator) -> NoiseSample:
         """Return a sample of the noise of the residual, and of the controls a priori."""
         residual = self.transport.sample(generator)
         controls = self.box.white((len(residual) + 1, 3, *self.box.shape), True, generator)
-        return Sample(residual / self.transport.deviation, controls)
+        return NoiseSample(residual / self.transport.deviation, controls)
 
     @torch.no_grad()
     def flow(self, controls: Tensor, falling: bool = False) -> Flow:
@@ -172,8 +169,8 @@ class Problem:
 
 
 def minimise(
-    problem: Problem, controls: Tensor, max_iterations: int, before: int, limit: float,
-    report: Callable[[float, Tensor, int], float], noise: Sample | None = None, enough: float = 0.0,
+    problem: VelocityProblem, controls: Tensor, max_iterations: int, before: int, limit: float,
+    report: Callable[[float, Tensor, int], float], noise: NoiseSample | None = None, enough: float = 0.0,
 ) -> tuple[Tensor, int, bool]:  # fmt: skip
     """Return the best controls, the number of evaluations, and whether the objective was still falling at the end.
 

@@ -26,7 +26,7 @@ class Monitor:
     training: Callable[[str], AbstractContextManager[OnStep]] = lambda title: nullcontext(_quiet)
     counting: Callable[[str], AbstractContextManager[Callable[[int, int], None]]] = lambda title: nullcontext(_quiet)
 
-    def telling(self, on_step: OnStep) -> Monitor:
+    def with_callback(self, on_step: OnStep) -> Monitor:
         """Return a monitor that also calls `on_step` with every Step."""
 
         @contextmanager

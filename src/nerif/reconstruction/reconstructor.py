@@ -256,5 +256,5 @@ class Reconstructor(ABC):
         return self, ""
 
     @abstractmethod
-    def in_two(self) -> tuple[Reconstructor, Reconstructor]:
+    def split_for_cross_validation(self) -> tuple[Reconstructor, Reconstructor]:
         """Return settings of a short first run, and of a run that starts from its field within the same limits."""

@@ -41,7 +41,7 @@ from nerif.reconstruction.rig_parameters import (
     with_corrections,
 )
 from nerif.reconstruction.sources import of_source
-from nerif.reconstruction.target import Part, Target
+from nerif.reconstruction.target import Target, TechniqueData
 
 __all__ = ["MOMENTUM", "Refinement", "load_rig", "random_pixels", "refit", "rig_state", "with_rig"]
 
@@ -54,7 +54,7 @@ STRETCHES = ("u_x", "v_y")  # of all images: a field that is a parabola across, 
 MIN_WEIGHT = 0.05  # in the common mean, of a direction without information from the data
 REFIT_STEPS, REFIT_PIXELS, REFIT_SAMPLES = 6, 600, 64  # steps, pixels per view and step, samples per ray
 
-Predict = Callable[[Part, Rays], Float[Tensor, "n k"]]
+Predict = Callable[[TechniqueData, Rays], Float[Tensor, "n k"]]
 """Returns the path integral of the present field along rays of a part."""
 
 
@@ -145,7 +145,7 @@ class Refinement:
         """Whether the data have shown a pose error."""
         return self.signs >= SIGNS
 
-    def of(self, part: Part, cameras: Sequence[int] | None = None) -> Part:
+    def of(self, part: TechniqueData, cameras: Sequence[int] | None = None) -> TechniqueData:
         """Return a part, of all views or those of some cameras, with refined rays and displacements of its images."""
         rays = part.rays
         if cameras is not None and list(cameras) != list(range(len(self.cameras))):
@@ -192,7 +192,7 @@ class Refinement:
     # -- steps ---------------------------------------------------------------------------------------------------
 
     def step(
-        self, parts: Sequence[Part], predict: Predict, sigma_known: bool = True, momentum: float = MOMENTUM,
+        self, parts: Sequence[TechniqueData], predict: Predict, sigma_known: bool = True, momentum: float = MOMENTUM,
         sign_factor: float = 0.0,
     ) -> None:  # fmt: skip
         """Take a Gauss-Newton step plus a share of the step before.
@@ -227,7 +227,7 @@ class Refinement:
         self.values = self._centred(self.values + self.velocity, weights)
 
     def normal_equations(
-        self, parts: Sequence[Part], predict: Predict, sigma_known: bool = True
+        self, parts: Sequence[TechniqueData], predict: Predict, sigma_known: bool = True
     ) -> tuple[Float[Tensor, "view k k"], Float[Tensor, "view k"]]:
         """Return J^T W J and -J^T W r of each view for its refined parameters."""
         views, k = len(self.cameras), len(self.columns)
@@ -255,7 +255,7 @@ class Refinement:
         self.explained = explained / total - parameters / count
         return normal, right
 
-    def slopes(self, part: Part, predict: Predict) -> tuple[Float[Tensor, "n c"], Float[Tensor, "n c k"]]:
+    def slopes(self, part: TechniqueData, predict: Predict) -> tuple[Float[Tensor, "n c"], Float[Tensor, "n c k"]]:
         """Return the residual of a part, and its derivatives by the refined parameters."""
         increments = self._increments()
         now, integral = self.residual(part, self.values, predict)
@@ -268,7 +268,7 @@ class Refinement:
         return now.double().cpu(), torch.stack(slopes, dim=-1).double().cpu()
 
     def residual(
-        self, part: Part, values: Float[Tensor, "view 14"], predict: Predict, integral: Tensor | None = None
+        self, part: TechniqueData, values: Float[Tensor, "view 14"], predict: Predict, integral: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
         """Return the residual of a part of calibrated rays, without reducing outliers, and the path integral."""
         if integral is None:
@@ -347,7 +347,7 @@ def _rigid_motion(camera: Camera) -> Float[Tensor, "6 6"]:
     return motion
 
 
-def random_pixels(target: Target, views: int, seed: int, per_view: int = PIXELS) -> list[Part]:
+def random_pixels(target: Target, views: int, seed: int, per_view: int = PIXELS) -> list[TechniqueData]:
     """Draw about `per_view` pixels of each of the views of a target, with residuals in units of sigma."""
     parts, generator, unit = [], torch.Generator().manual_seed(seed), math.sqrt(target.chi_square)
     for part in target.parts:
@@ -388,7 +388,7 @@ def refit(
     rig = Refinement.of_table(measurement, settings, (), gauged=False)
     target = Target.of(measurement, tuple(settings["open_faces"]), linear=True).to(device)
 
-    def predict(part: Part, rays: Rays) -> Tensor:
+    def predict(part: TechniqueData, rays: Rays) -> Tensor:
         return project(PathIntegral(part.model.integral, REFIT_SAMPLES), field, rays, device)
 
     for i in range(steps):

@@ -22,7 +22,7 @@ from nerif.data.measurement import Measurement
 from nerif.data.measurement_data import Observation
 from nerif.forward.forward_model import masked_blur
 
-__all__ = ["Stage", "check_source", "of_source", "resolve_source", "stages"]
+__all__ = ["DataStage", "check_source", "of_source", "resolve_source", "stages"]
 
 SOURCES = ("auto", "images", "displacements", "both")
 SOFT_PX = 0.6  # standard deviation
@@ -33,7 +33,7 @@ FITTED_AGAIN = (0.5, 0.75)  # of a run: intensity gains and offsets are fitted a
 
 
 @dataclass(frozen=True)
-class Stage:
+class DataStage:
     """A part of a run."""
 
     begin: float  # share of the run at which it begins
@@ -88,7 +88,7 @@ def of_source(measurement: Measurement, source: str, blur: float = SOFT_PX, pref
     return replace(whole, maps=maps)
 
 
-def stages(measurement: Measurement, source: str) -> list[Stage]:
+def stages(measurement: Measurement, source: str) -> list[DataStage]:
     """Return the stages of the training of a network."""
     images, displacements = _pair(measurement)
     final = of_source(measurement, source)
@@ -97,14 +97,14 @@ def stages(measurement: Measurement, source: str) -> list[Stage]:
         return final
 
     if images is None or source == "displacements":
-        return [Stage(0.0, last, " and ".join(o.technique.measured for o in final.observations))]
-    ends = [Stage(begin, last, "images") for begin in (SHARP_FROM, *FITTED_AGAIN)]
+        return [DataStage(0.0, last, " and ".join(o.technique.measured for o in final.observations))]
+    ends = [DataStage(begin, last, "images") for begin in (SHARP_FROM, *FITTED_AGAIN)]
     if displacements is not None:
-        return [Stage(0.0, partial(of_source, measurement, "displacements"), "displacements"), *ends]
+        return [DataStage(0.0, partial(of_source, measurement, "displacements"), "displacements"), *ends]
     blurred = []
     for i, px in enumerate(BLURS_PX):
         data = partial(of_source, measurement, source, px)
-        blurred.append(Stage(SHARP_FROM * i / len(BLURS_PX), data, f"images blurred by {px:g} px"))
+        blurred.append(DataStage(SHARP_FROM * i / len(BLURS_PX), data, f"images blurred by {px:g} px"))
     return [*blurred, *ends]
 
 

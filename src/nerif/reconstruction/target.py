@@ -18,13 +18,13 @@ from nerif.forward.registry import AUTO, forward_models
 from nerif.geometry import Rays
 from nerif.reconstruction.bins import binned_rays, patches
 
-__all__ = ["Part", "Target", "check_target"]
+__all__ = ["Target", "TechniqueData", "check_target"]
 
 PIECE_RAYS = 1 << 17
 
 
 @dataclass(frozen=True)
-class Part:
+class TechniqueData:
     """Rays and their measured values by one technique."""
 
     model: ForwardModel
@@ -37,12 +37,12 @@ class Part:
     def __len__(self) -> int:
         return len(self.rays)
 
-    def __getitem__(self, index: Tensor | slice) -> Part:
+    def __getitem__(self, index: Tensor | slice) -> TechniqueData:
         measured, inverse = self.measured[index], self.inverse_scale[index]
         offset = None if self.offset is None else self.offset[index]
         return replace(self, rays=self.rays[index], measured=measured, inverse_scale=inverse, offset=offset)
 
-    def to(self, device: torch.device | str) -> Part:
+    def to(self, device: torch.device | str) -> TechniqueData:
         measured, inverse = self.measured.to(device), self.inverse_scale.to(device)
         return replace(self, rays=self.rays.to(device), measured=measured, inverse_scale=inverse)
 
@@ -65,7 +65,7 @@ class Part:
         """The measured values less the offset, for models whose path integral is the measured quantity."""
         return self.measured if self.offset is None else self.measured - self.offset.to(self.measured)
 
-    def split(self) -> list[Part]:
+    def split(self) -> list[TechniqueData]:
         """Return the part in pieces that need little memory."""
         return [self[i : i + PIECE_RAYS] for i in range(0, len(self), PIECE_RAYS)]
 
@@ -83,7 +83,7 @@ def check_target(measurement: Measurement, model: str = AUTO, linear: bool = Fal
 class Target:
     """The data of all techniques."""
 
-    parts: tuple[Part, ...]  # one for each technique
+    parts: tuple[TechniqueData, ...]  # one for each technique
     scale: float  # typical size of the field, from that of the data
     # mean square of the ambient field's residual over sigma (over 1 without sigma): the factor from the mean square of
     # a scaled residual to that in units of the noise
@@ -111,7 +111,7 @@ class Target:
             measured, noise = forward.reading(values, sigma if observation.sigma is not None else None, rays)
             noise = sigma if observation.sigma is None else noise  # of bins: by their number of pixels
             inverse = torch.ones_like(measured) if noise is None else 1 / noise
-            parts.append(Part(forward, rays, measured, inverse))
+            parts.append(TechniqueData(forward, rays, measured, inverse))
         empty = torch.cat([p.ambient_residual.flatten() for part in parts for p in part.split()])
         chi_square = float(empty.square().mean()) or 1.0  # for data that are all 0
         unit = 1 / math.sqrt(chi_square)
@@ -164,7 +164,7 @@ def _rays(
     return rays[keep], values[keep], None if sigma is None else sigma[keep]
 
 
-def _noise_share(parts: list[Part], chi_square: float) -> float:
+def _noise_share(parts: list[TechniqueData], chi_square: float) -> float:
     """Mean square residual of the noise over that of the ambient field, both by Huber's loss.
 
     Of a standard normal variable the mean of min(z^2, c |z|) is erf(c / sqrt 2).

@@ -158,7 +158,7 @@ class CrossValidation:
 
     @property
     def _run(self) -> CheckpointedRun:
-        short, _ = self.reconstructor.in_two()
+        short, _ = self.reconstructor.split_for_cross_validation()
         return CheckpointedRun(
             self._directory, short, self.data.without([self.view]), checkpoint_every=self.checkpoint_every,
             monitor=self.monitor, restart=self.restart, limits=LIMITS,

@@ -26,8 +26,8 @@ from nerif.data.measurement_sequence import MeasurementSequence, check_store
 from nerif.data.velocity_sequence import VelocitySequence
 from nerif.data.volume import COMPONENTS, INDEX
 from nerif.data.volume_sequence import FIELDS, VolumeSequence
-from nerif.flow.assimilation import Iterate, State, VelocityFit
-from nerif.flow.box_domain import Space, section_of
+from nerif.flow.assimilation import FitIterate, FitState, VelocityFit
+from nerif.flow.box_domain import BoxDomain, section_of
 from nerif.flow.film_density import FilmDensity
 from nerif.flow.flow import Flow
 from nerif.geometry.symmetry import Symmetry
@@ -51,7 +51,7 @@ def velocity_of_film(
     measurement: str | os.PathLike[str] | None = None,
     density: Literal[*DENSITY] = "auto",  # type: ignore[valid-type]
     force: bool = False,
-    on_iterate: Callable[[Iterate], None] = lambda iterate: None,
+    on_iterate: Callable[[FitIterate], None] = lambda iterate: None,
     say: Callable[[str], None] = lambda line: None,
 ) -> VelocitySequence:
     """Compute velocity and pressure from the densities of a film, and write them to a store.
@@ -94,7 +94,7 @@ def velocity_of_film(
     inputs = digest([theta, list(times), place, _without_limits(method), displacements])
     saved = time.monotonic()
 
-    def update(iterate: Iterate, best: State) -> None:
+    def update(iterate: FitIterate, best: FitState) -> None:
         nonlocal saved
         if best.controls is not None and time.monotonic() - saved > CHECKPOINT_INTERVAL:
             about = {"inputs": inputs, "stage": best.stage, "iterations": best.iterations, "seconds": best.seconds}
@@ -205,7 +205,7 @@ def _without_limits(settings: VelocityFit) -> dict[str, Any]:
     return {name: value for name, value in asdict(settings).items() if name not in later}
 
 
-def _resumed(checkpoint: Path, inputs: str, say: Callable[[str], None]) -> State | None:
+def _resumed(checkpoint: Path, inputs: str, say: Callable[[str], None]) -> FitState | None:
     """Return the state in a checkpoint of the same inputs."""
     if not checkpoint.exists():
         return None
@@ -214,12 +214,12 @@ def _resumed(checkpoint: Path, inputs: str, say: Callable[[str], None]) -> State
         say(f"{checkpoint}: of another film or other settings; started again")
         return None
     say(f"continuing after {about['iterations']} iterations")
-    return State(about["stage"], tensors["controls"], tensors.get("theta"), about["iterations"], about["seconds"])
+    return FitState(about["stage"], tensors["controls"], tensors.get("theta"), about["iterations"], about["seconds"])
 
 
 def _write(
     out: Path, film: VolumeSequence, theta: Tensor, times: Sequence[float], settings: VelocityFit, flow: Flow,
-    section: Space, say: Callable[[str], None],
+    section: BoxDomain, say: Callable[[str], None],
 ) -> VelocitySequence:  # fmt: skip
     """Write a flow on the grid of the film, in SI units."""
     gas = GasSettings(**film.attributes["gas"]) if "gas" in film.attributes else GasSettings()

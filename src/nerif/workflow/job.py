@@ -24,7 +24,7 @@ from nerif.fields.field import Field
 from nerif.geometry import Box, Grid
 from nerif.physics.quantities import GasSettings
 from nerif.reconstruction.aperture import apply_aperture
-from nerif.reconstruction.detail.detail import Choice, Posterior, check_sigma
+from nerif.reconstruction.detail.detail import DetailChoice, Posterior, check_sigma
 from nerif.reconstruction.field_files import CHECKPOINT, FIELD
 from nerif.reconstruction.methods import method_name
 from nerif.reconstruction.neural.neural import NeRIF
@@ -199,7 +199,7 @@ class Job:
     quantities : of the result, as volumes, once they are sampled
     """
 
-    detail: Choice | None = None
+    detail: DetailChoice | None = None
     result: Reconstruction | None = None
     rig: RigPosterior | None = None
     posterior: Posterior | None = None
@@ -239,7 +239,7 @@ class Job:
         if shortage:
             monitor.say(shortage)
         pace = Pace(self.budget.allot(self.reconstructor, 1 / (1 + self.trials.members)), monitor.say, shortage)
-        self.monitor = monitor.telling(pace)
+        self.monitor = monitor.with_callback(pace)
         self.method, self.initial = self.reconstructor, self.start
         self.measurement, self.withheld = self.inputs.measurement, self.inputs.withheld
         self.settings = self._settings(keep or {})

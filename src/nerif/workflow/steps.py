@@ -27,7 +27,7 @@ from nerif.data.measurement import Measurement
 from nerif.data.volume import describe
 from nerif.geometry import Grid
 from nerif.physics.quantities import masked_lines
-from nerif.reconstruction.detail.detail import COARSE, EARLY, ITERATIONS, SIGNIFICANT, Choice, Detail, choose
+from nerif.reconstruction.detail.detail import COARSE, EARLY, ITERATIONS, SIGNIFICANT, Detail, DetailChoice, choose
 from nerif.reconstruction.field_files import FIELD, checkpoints
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.reconstructor import Reconstruction, compose
@@ -86,7 +86,7 @@ class CrossValidate(PipelineStep):
         short = job.validation(job.begin)
         if short is None:
             return
-        job.initial, job.method = short.field, job.reconstructor.in_two()[1]
+        job.initial, job.method = short.field, job.reconstructor.split_for_cross_validation()[1]
         if short.outcome.reason == "interrupted":
             job.result = replace(short, state=None, box=job.inputs.box)
             job.measurement, job.withheld = job.validation.data, (job.validation.view,)
@@ -126,11 +126,11 @@ class ChooseDetail(PipelineStep):
         return Detail(fit.field, fit.training, settings, axis, COARSE), fit.withheld
 
     @staticmethod
-    def choice(job: Job, left: float) -> Choice | None:
+    def choice(job: Job, left: float) -> DetailChoice | None:
         """Return how detail is added, or None; `left`: seconds until the limit."""
         on, fit = job.run.detail == "on", ChooseDetail.coarse(job)
         if fit is None:
-            return Choice() if on else None
+            return DetailChoice() if on else None
         coarse, withheld = fit
         if coarse.residual < EARLY and not on:
             return None
@@ -424,7 +424,7 @@ CLOSING: tuple[type[PipelineStep], ...] = (Judge, WriteReport)
 """Run whatever became of the others, if there is a field."""
 
 
-def share(job: Job, choice: Choice) -> float:
+def share(job: Job, choice: DetailChoice) -> float:
     """Return the largest share of the time left that detail may take.
 
     A first run that explains little of its data does not show what a longer one would leave: training comes first.

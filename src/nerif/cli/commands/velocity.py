@@ -15,7 +15,7 @@ from nerif.cli.commands.settings import Flat, Settings, command
 from nerif.common.conventions import InputError
 from nerif.data.velocity_sequence import VelocitySequence
 from nerif.data.volume import INDEX
-from nerif.flow.assimilation import Iterate, VelocityFit
+from nerif.flow.assimilation import FitIterate, VelocityFit
 from nerif.workflow.film_velocity import DENSITY, velocity_of_film
 from nerif.workflow.reports import write_sequence_report
 
@@ -58,7 +58,7 @@ def run(settings: Velocity) -> VelocitySequence:
     check_output(settings.out, settings.force, endings=(".zarr",))
     with figures_bar("velocity") as bar:
 
-        def update(iterate: Iterate) -> None:
+        def update(iterate: FitIterate) -> None:
             figures = f"{iterate.what}, stage {iterate.stage + 1}/{iterate.stages} | iteration {iterate.iterations} | "
             figures += f"residual {iterate.misfit:.2f} sigma | {iterate.seconds:.0f} s"
             limit = settings.fit.time_limit

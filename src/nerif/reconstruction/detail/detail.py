@@ -48,7 +48,7 @@ from nerif.reconstruction.voxels.levels import bins_of, resolved_voxels
 from nerif.reconstruction.voxels.total_variation import gradient_square
 from nerif.reconstruction.voxels.voxel_problem import Iterate, Problem
 
-__all__ = ["Choice", "Detail", "Posterior", "check_sigma", "choose"]
+__all__ = ["Detail", "DetailChoice", "Posterior", "check_sigma", "choose"]
 
 MOST_VOXELS = 160  # along the longest edge of the box
 COARSE = 2  # fine voxels, and pixels, in a coarse one
@@ -312,7 +312,7 @@ class Detail:
 
 
 @dataclass(frozen=True)
-class Choice:
+class DetailChoice:
     """Which mean and prior predict a withheld view best.
 
     Parameters
@@ -341,7 +341,7 @@ class Choice:
         The cross-validation ends early: a field that explains most of its detail by now is not blurred.
         """
         if self.blurred and fine.explained > EXPLAINED:
-            return Choice().solve(fine, coarse, watch)
+            return DetailChoice().solve(fine, coarse, watch)
         problem = None
         if self.passes != 1:
             first = coarse.solve(coarse.first(self.blurred))
@@ -363,7 +363,7 @@ class Choice:
 def choose(
     coarse: Detail, withheld: Measurement, most: float = math.inf,
     on_done: Callable[[int, int], None] = lambda done, total: None,
-) -> Choice:  # fmt: skip
+) -> DetailChoice:  # fmt: skip
     """Return which mean and prior predict the withheld views of a field best, on a coarse grid.
 
     Every second band of their pixels chooses; the stated errors are those of the other bands.
@@ -375,7 +375,7 @@ def choose(
     target, start = coarse.others(withheld), time.perf_counter()
     band = torch.arange(len(target)) * 2 * BANDS // max(len(target), 1)
     choosing, scoring = (target[(band % 2 == half).nonzero()[:, 0]] for half in (0, 1))
-    best = Choice(before=coarse.prediction_error(scoring, coarse.mean(blurred=False)), after=math.inf)
+    best = DetailChoice(before=coarse.prediction_error(scoring, coarse.mean(blurred=False)), after=math.inf)
     lowest, posterior = math.inf, None
     for trial, (blurred, passes) in enumerate(itertools.product((False, True), (1, 2)), start=1):
         problem = coarse.next(posterior) if posterior and passes == 2 else coarse.first(blurred)

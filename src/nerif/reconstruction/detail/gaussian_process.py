@@ -47,7 +47,7 @@ class GaussianProcess(SharedSettings):
     iterations: Count = 30
     """Iterations of conjugate gradients on each grid, at most."""
 
-    def in_two(self) -> tuple[GaussianProcess, GaussianProcess]:
+    def split_for_cross_validation(self) -> tuple[GaussianProcess, GaussianProcess]:
         short = replace(self, voxels=max(8, self.voxels // 2), time_limit=SHORT_RUN * self.time_limit)
         return short, self
 

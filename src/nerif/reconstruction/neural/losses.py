@@ -24,7 +24,7 @@ from nerif.forward.forward_model import Weights
 from nerif.forward.path_integral import places
 from nerif.geometry import Rays
 from nerif.reconstruction.device import autocast_dtype, float32_products, keep_compiled_code_private
-from nerif.reconstruction.target import Part
+from nerif.reconstruction.target import TechniqueData
 
 __all__ = ["DATA_TERMS", "Evaluator", "LossWeights", "MixedPrecision", "loss_terms"]
 
@@ -152,8 +152,8 @@ def _fusible(network: Network) -> bool:
 
 
 def loss_terms(
-    field: NeuralField, network: Evaluator, part: Part, rays: Rays, s: Float[Tensor, "n m"], step: Float[Tensor, "n m"],
-    weights: LossWeights, norm: str,
+    field: NeuralField, network: Evaluator, part: TechniqueData, rays: Rays, s: Float[Tensor, "n m"],
+    step: Float[Tensor, "n m"], weights: LossWeights, norm: str,
 ) -> dict[str, Tensor]:  # fmt: skip
     """Return the terms of positive weight by name, unweighted.
 

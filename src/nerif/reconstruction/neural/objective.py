@@ -9,10 +9,10 @@ from nerif.common.transfer import to_device
 from nerif.fields.network import NeuralField
 from nerif.forward.path_integral import LENS_RAYS
 from nerif.reconstruction.neural.losses import DATA_TERMS, MixedPrecision, loss_terms, reduce
-from nerif.reconstruction.neural.sampling import Batch, Draw, SamplingDensity, sample_rays
+from nerif.reconstruction.neural.sampling import Batch, PixelSampling, SamplingDensity, sample_rays
 from nerif.reconstruction.neural.training_data import TrainingData, shuffled
 from nerif.reconstruction.neural.training_settings import TrainingSettings
-from nerif.reconstruction.target import Part
+from nerif.reconstruction.target import TechniqueData
 
 __all__ = ["Objective"]
 
@@ -66,7 +66,7 @@ class Objective:
         """Return the value of each data term in the ambient field."""
         return self._ambient_term([p.part for p in batch.pieces], [p.numbers for p in batch.pieces])
 
-    def _ambient_term(self, parts: list[Part], numbers: list[int]) -> Tensor:
+    def _ambient_term(self, parts: list[TechniqueData], numbers: list[int]) -> Tensor:
         terms = (reduce(part.ambient_residual, self.settings.norm) for part in parts)
         total = sum(share * term for share, term in zip(shares(numbers), terms, strict=True))
         assert isinstance(total, Tensor)
@@ -96,7 +96,8 @@ class Objective:
         for part in withheld.parts:
             thin = part.rays.lens is None
             size = WITHHELD_BATCH if thin else WITHHELD_BATCH // 4
-            draw = Draw(1, WITHHELD_SAMPLES) if thin else Draw(LENS_RAYS, 4 * WITHHELD_SAMPLES // LENS_RAYS)
+            samples = (1, WITHHELD_SAMPLES) if thin else (LENS_RAYS, 4 * WITHHELD_SAMPLES // LENS_RAYS)
+            draw = PixelSampling(*samples)
             for first in range(0, len(part), size):
                 batch = self.data.with_rig(part[first : first + size], withheld=True)
                 rays = draw.rays_of(batch, generator)

@@ -13,7 +13,7 @@ from nerif.geometry import Rays
 from nerif.reconstruction.neural.sampling import SamplingDensity, sample_rays
 from nerif.reconstruction.neural.training_data import TrainingData
 from nerif.reconstruction.rig_refinement import MOMENTUM
-from nerif.reconstruction.target import Part
+from nerif.reconstruction.target import TechniqueData
 
 __all__ = ["refine_rig"]
 
@@ -34,7 +34,7 @@ def refine_rig(data: TrainingData, field: NeuralField, density: SamplingDensity,
     if rig.steps >= due or (progress > SIGN_UNTIL and not rig.off):
         return
 
-    def predict(part: Part, rays: Rays) -> Tensor:
+    def predict(part: TechniqueData, rays: Rays) -> Tensor:
         generator = torch.Generator().manual_seed(rig.steps)  # the same samples for all poses
         integrals = []
         for index in torch.arange(len(rays)).split(BATCH):

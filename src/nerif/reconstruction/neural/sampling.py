@@ -23,9 +23,9 @@ from nerif.reconstruction.neural.parallel import Ranks
 from nerif.reconstruction.neural.schedule import Schedule
 from nerif.reconstruction.neural.training_data import TrainingData, shuffled
 from nerif.reconstruction.neural.training_settings import TrainingSettings
-from nerif.reconstruction.target import Part
+from nerif.reconstruction.target import TechniqueData
 
-__all__ = ["Batch", "Draw", "Piece", "Sampler", "SamplingDensity", "sample_count", "sample_rays"]
+__all__ = ["Batch", "PixelSampling", "RayBatch", "Sampler", "SamplingDensity", "sample_count", "sample_rays"]
 
 EVEN_SHARE = 0.1  # of the samples, spread evenly
 DENSITY_BINS = 40  # along a ray
@@ -105,19 +105,19 @@ def sample_rays(
 
 
 @dataclass(frozen=True)
-class Draw:
+class PixelSampling:
     """Sampling of a pixel: rays through its lens (1 without a lens), and samples per ray."""
 
     rays: int
     samples: int
 
-    def rays_of(self, part: Part, generator: torch.Generator) -> Rays:
+    def rays_of(self, part: TechniqueData, generator: torch.Generator) -> Rays:
         """Return the rays of the pixels: their own, or several consecutive ones through the lens of each."""
         return part.rays if part.rays.lens is None else part.rays.spread(self.rays, generator)
 
 
 @dataclass(frozen=True)
-class Piece:
+class RayBatch:
     """Rays of one technique in a step.
 
     Parameters
@@ -129,7 +129,7 @@ class Piece:
         processes average the same terms and the gradients of the same weights
     """
 
-    part: Part
+    part: TechniqueData
     rays: Rays
     s: Tensor
     interval: Tensor
@@ -147,7 +147,7 @@ class Batch:
     low : whether the network is evaluated in low precision
     """
 
-    pieces: list[Piece]
+    pieces: list[RayBatch]
     numbers: int
     low: bool = False
 
@@ -178,34 +178,34 @@ class Sampler:
             self.density.update(self.network)
         return self.of(index, draw, schedule.progress < settings.full_precision_from)
 
-    def of(self, index: Int[Tensor, " b"], draw: Draw, low: bool = False) -> Batch:
+    def of(self, index: Int[Tensor, " b"], draw: PixelSampling, low: bool = False) -> Batch:
         """Return the batch of pixels by index."""
         parts = self.data.batch(index)
         return Batch([self._piece(part, draw) for part in parts], sum(part.measured.numel() for part in parts), low)
 
-    def draw(self, progress: float) -> Draw:
+    def draw(self, progress: float) -> PixelSampling:
         """Draw the sampling of the pixels of a step."""
         samples = sample_count(progress, *self.data.samples, self.settings.sample_jitter, self.generator)
         return self._draw(progress, samples)
 
     @property
-    def mean_draw(self) -> Draw:
+    def mean_draw(self) -> PixelSampling:
         """The mean sampling of a run."""
         return self._draw(0.5, round(sum(self.data.samples) / 2))
 
-    def _draw(self, progress: float, samples: int) -> Draw:
+    def _draw(self, progress: float, samples: int) -> PixelSampling:
         last = self.data.lens_rays
         if last == 1:
-            return Draw(1, samples)
+            return PixelSampling(1, samples)
         first = max(2, 2 * (last // 6))
         rays = 2 * round((first + (last - first) * min(progress, 1.0)) / 2)
-        return Draw(rays, max(MIN_LENS_SAMPLES, round((1 + (last - 2) / FULL_RAYS) * samples / rays)))
+        return PixelSampling(rays, max(MIN_LENS_SAMPLES, round((1 + (last - 2) / FULL_RAYS) * samples / rays)))
 
-    def pixels(self, draw: Draw) -> int:
+    def pixels(self, draw: PixelSampling) -> int:
         """Return the pixels of a step with that sampling."""
         return min(max(self.ranks.size, self.settings.points_per_batch // (draw.rays * draw.samples)), len(self.data))
 
-    def _piece(self, part: Part, draw: Draw) -> Piece:
+    def _piece(self, part: TechniqueData, draw: PixelSampling) -> RayBatch:
         rays, pixels = draw.rays_of(part, self.generator), self.ranks.share
         numbers = part.measured[pixels].numel()
         pixels = pixels if numbers else slice(0, 1)
@@ -215,4 +215,4 @@ class Sampler:
             index = torch.arange(len(part), device=rays.near.device)[pixels]
             index = (index[:, None] * each + torch.arange(each, device=index.device)).flatten()
             rays, s, interval = rays[index], s[index], interval[index]
-        return Piece(part[pixels], rays, s, interval, numbers)
+        return RayBatch(part[pixels], rays, s, interval, numbers)

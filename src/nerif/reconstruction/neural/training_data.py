@@ -34,7 +34,7 @@ from nerif.reconstruction.neural.training_settings import TrainingSettings
 from nerif.reconstruction.rig_parameters import RefinedView, refined_groups
 from nerif.reconstruction.rig_refinement import Refinement, load_rig, random_pixels, rig_state
 from nerif.reconstruction.sources import of_source, resolve_source, stages
-from nerif.reconstruction.target import Part, Target, check_target
+from nerif.reconstruction.target import Target, TechniqueData, check_target
 from nerif.reconstruction.voxels.symmetry_axis import axis_of
 
 __all__ = ["TrainingData", "shuffled"]
@@ -163,11 +163,11 @@ class TrainingData:
     def __len__(self) -> int:
         return len(self.target)
 
-    def batch(self, index: Int[Tensor, " b"]) -> list[Part]:
+    def batch(self, index: Int[Tensor, " b"]) -> list[TechniqueData]:
         """Return rays by index with their measured values, one part per technique."""
         return [self.with_rig(part) for part in self.target[index].parts if len(part)]
 
-    def with_rig(self, part: Part, withheld: bool = False) -> Part:
+    def with_rig(self, part: TechniqueData, withheld: bool = False) -> TechniqueData:
         """Return a part, of withheld pixels or not, with the refined rig."""
         if self.refinement is None:
             return part
@@ -178,7 +178,7 @@ class TrainingData:
         """Return the present corrections of the cameras; none if they are not refined."""
         return [] if self.refinement is None else self.refinement.table()
 
-    def rig_pixels(self, seed: int) -> list[Part]:
+    def rig_pixels(self, seed: int) -> list[TechniqueData]:
         """Draw pixels for a step of the rig, with their calibrated rays; none in a stage without all views."""
         if self.refinement is None or self.names != self.refinement.names:
             return []

@@ -121,7 +121,7 @@ class TrainingSettings(SharedSettings):
             return self.samples
         return (24, 48) if steep else (12, 24)
 
-    def in_two(self) -> tuple[TrainingSettings, TrainingSettings]:
+    def split_for_cross_validation(self) -> tuple[TrainingSettings, TrainingSettings]:
         steps = (
             (max(1, round(SHORT_RUN * self.max_steps)) if self.max_steps else 0) if self.limited else self.first_cycle
         )

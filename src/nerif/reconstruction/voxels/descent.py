@@ -48,7 +48,7 @@ from nerif.reconstruction.voxels.weight import COARSE_WEIGHT, DISCREPANCY, choos
 if TYPE_CHECKING:
     from nerif.reconstruction.voxels.voxel_reconstructor import VoxelReconstructor
 
-__all__ = ["Descent"]
+__all__ = ["VoxelRun"]
 
 PIXELS = 1 << 16  # about as many, whose residual is computed where a level has bins: to half a per cent
 COARSE_TOLERANCE = 10  # times the tolerance, for weights of a search
@@ -69,7 +69,7 @@ class _Stop(Exception):
     """The end of a run, with the arguments of its Outcome."""
 
 
-class Descent:
+class VoxelRun:
     """One run of a voxel method."""
 
     def __init__(

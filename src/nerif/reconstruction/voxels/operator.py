@@ -15,7 +15,7 @@ from nerif.fields.voxel_field import DEGREES, Boundary, VoxelField
 from nerif.forward.forward_model import ForwardModel
 from nerif.geometry import Grid, Rays
 from nerif.reconstruction.device import share_threads
-from nerif.reconstruction.voxels.planes import Bundle
+from nerif.reconstruction.voxels.planes import RayBundle
 
 __all__ = ["VoxelOperator", "apply_rows", "check_step", "operator_norm", "rays_through"]
 
@@ -80,7 +80,7 @@ class VoxelOperator:
         self._place_samples(rays, model)
 
     def _place_samples(self, rays: Rays, model: ForwardModel) -> None:
-        bundles = Bundle.all_of(rays, self.grid, self.degree, math.ceil(1 / self.step), model)
+        bundles = RayBundle.all_of(rays, self.grid, self.degree, math.ceil(1 / self.step), model)
         self.bundles = [bundle.to(self.device, self.inner, self.dtype) for bundle in bundles]
 
     @property

@@ -19,7 +19,7 @@ from nerif.fields.voxel_field import spline_weights
 from nerif.forward.forward_model import ForwardModel, Weights
 from nerif.geometry import Grid, Rays
 
-__all__ = ["Bundle", "Planes", "profiles"]
+__all__ = ["Planes", "RayBundle", "profiles"]
 
 EVEN = 1e-9  # of the largest weight: tolerated deviation from the line between the ends of a ray
 PROBES = (0.0, 0.0931, 0.2718, 0.3819, 0.5, 0.6543, 0.8191, 0.9397, 1.0)  # along a ray; irregular, against aliasing
@@ -84,7 +84,7 @@ class Planes:
 
 
 @dataclass(frozen=True)
-class Bundle:
+class RayBundle:
     """Rays that follow the same axis most closely, with their samples.
 
     Sample m of a ray is on plane first + m, at start + m stride, with weight profile_0 + m profile_1 or profile_m; the
@@ -109,7 +109,7 @@ class Bundle:
         return self.start, self.stride, self.profile, self.lost, self.first, self.count
 
     @classmethod
-    def all_of(cls, rays: Rays, grid: Grid, degree: int, each: int, model: ForwardModel) -> list[Bundle]:
+    def all_of(cls, rays: Rays, grid: Grid, degree: int, each: int, model: ForwardModel) -> list[RayBundle]:
         """Sort rays, clipped to the box, by the axis that they follow most closely."""
         crosses = rays.crosses.nonzero()[:, 0]
         spacing = torch.tensor(grid.spacing, dtype=torch.float64, device=rays.near.device)
@@ -118,7 +118,7 @@ class Bundle:
         return [cls._of(rays[i], i, Planes(grid, degree, a, each), model) for a, i in numbers if len(i)]
 
     @classmethod
-    def _of(cls, rays: Rays, index: Int[Tensor, " n"], planes: Planes, model: ForwardModel) -> Bundle:
+    def _of(cls, rays: Rays, index: Int[Tensor, " n"], planes: Planes, model: ForwardModel) -> RayBundle:
         rays = rays.to(dtype=torch.float64)  # cameras are far away: positions lose digits in single precision
         grid, axis, each = planes.grid, planes.axis, planes.each
         spacing, lower = rays.near.new_tensor(grid.spacing), rays.near.new_tensor(grid.box.lower)
@@ -151,12 +151,12 @@ class Bundle:
         numbers = first.to(torch.int32), (last - first + 1).to(torch.int32)
         return cls(planes, index, start, stride, profile, lost, *numbers, gradient, value)
 
-    def to(self, device: torch.device, inner: torch.dtype, dtype: torch.dtype) -> Bundle:
+    def to(self, device: torch.device, inner: torch.dtype, dtype: torch.dtype) -> RayBundle:
         """Return the bundle on a device: paths in the kernels' precision, matrices in that of the projections."""
         path = [a.to(device, inner).contiguous() for a in (self.start, self.stride, self.profile, self.lost)]
         whole = [a.to(device).contiguous() for a in (self.first, self.count)]
         matrices = [None if m is None else m.to(device, dtype).contiguous() for m in (self.gradient, self.value)]
-        return Bundle(self.planes, self.index.to(device), *path, *whole, *matrices)
+        return RayBundle(self.planes, self.index.to(device), *path, *whole, *matrices)
 
 
 def profiles(model: ForwardModel, rays: Rays, s: Tensor, apart: Tensor, steps: Tensor) -> tuple[Weights, Tensor]:
@@ -168,7 +168,7 @@ def profiles(model: ForwardModel, rays: Rays, s: Tensor, apart: Tensor, steps: T
     ends = torch.stack([s, s + steps * apart], dim=1)
     weights = model.weights(rays, ends, apart.abs()[:, None].expand_as(ends))
     begin, final = weights.profile.unbind(1)
-    if _is_even(model, rays, s, apart, steps):
+    if _is_linear(model, rays, s, apart, steps):
         return weights, torch.stack([begin, (final - begin) / steps.clamp(min=1)], dim=1)
     m = torch.arange(int(steps.max()) + 1, dtype=s.dtype, device=s.device)
     parts = []
@@ -178,7 +178,7 @@ def profiles(model: ForwardModel, rays: Rays, s: Tensor, apart: Tensor, steps: T
     return weights, torch.cat(parts)[..., None]
 
 
-def _is_even(model: ForwardModel, rays: Rays, s: Tensor, apart: Tensor, steps: Tensor) -> bool:
+def _is_linear(model: ForwardModel, rays: Rays, s: Tensor, apart: Tensor, steps: Tensor) -> bool:
     """Whether the profile is linear along every ray."""
     shares = s.new_tensor(PROBES)
     for i in torch.arange(len(rays), device=s.device).split(CHUNK_RAYS):

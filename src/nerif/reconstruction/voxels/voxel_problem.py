@@ -20,7 +20,7 @@ from torch import Tensor
 
 from nerif.fields.voxel_field import Boundary
 from nerif.geometry import Grid, Rays
-from nerif.reconstruction.target import Part, Target
+from nerif.reconstruction.target import Target, TechniqueData
 from nerif.reconstruction.voxels.operator import VoxelOperator
 
 __all__ = [
@@ -128,7 +128,7 @@ class Problem:
         """|F x - b|^2 of single pixels due to noise alone; None where sigma is not known."""
         return (self.pixels or self).target.noise
 
-    def predict(self, part: Part, rays: Rays, x: Float[Tensor, "z y x"]) -> Float[Tensor, "n c"]:
+    def predict(self, part: TechniqueData, rays: Rays, x: Float[Tensor, "z y x"]) -> Float[Tensor, "n c"]:
         """Return the projections of x along other rays of the technique of a part."""
         parts = zip(self.operators, self.target.parts, strict=True)
         operator = next(operator for operator, p in parts if p.model.name == part.model.name)

@@ -23,7 +23,7 @@ from nerif.geometry import Grid
 from nerif.reconstruction.reconstructor import OnStep, Reconstruction, State
 from nerif.reconstruction.shared_settings import SHORT_RUN, SharedSettings, Source
 from nerif.reconstruction.voxels import kernels_torch
-from nerif.reconstruction.voxels.descent import Descent
+from nerif.reconstruction.voxels.descent import VoxelRun
 from nerif.reconstruction.voxels.levels import FINE_BIN, SMALLEST, bins_of, resolved_voxels
 from nerif.reconstruction.voxels.operator import VoxelOperator, check_step, rays_through
 from nerif.reconstruction.voxels.voxel_problem import Iterate, Problem
@@ -71,7 +71,7 @@ class VoxelReconstructor(SharedSettings):
         if self.step is not None:
             check_step(self.step, self.basis)
 
-    def in_two(self) -> tuple[VoxelReconstructor, VoxelReconstructor]:
+    def split_for_cross_validation(self) -> tuple[VoxelReconstructor, VoxelReconstructor]:
         voxels = max(min(MIN_VOXELS, self.voxels), self.voxels // 2)
         return replace(self, voxels=voxels, time_limit=SHORT_RUN * self.time_limit), self
 
@@ -135,7 +135,7 @@ class VoxelReconstructor(SharedSettings):
         self, measurement: Measurement, on_step: OnStep | None = None, resume: State | None = None,
         start: Field | None = None,
     ) -> Reconstruction:  # fmt: skip
-        return Descent(self, measurement, on_step, resume, start)()
+        return VoxelRun(self, measurement, on_step, resume, start)()
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from nerif.reconstruction.voxels.voxel_problem import Iterate
 
-__all__ = ["COARSE_WEIGHT", "DISCREPANCY", "Choice", "choose_weight", "sharpest_corner"]
+__all__ = ["COARSE_WEIGHT", "DISCREPANCY", "WeightChoice", "choose_weight", "sharpest_corner"]
 
 FACTOR = 10**0.5  # between one weight and the next
 HIGHEST, LOWEST = 1e-1, 1e-6
@@ -31,7 +31,7 @@ Solve = Callable[[float, Tensor], Iterate]
 
 
 @dataclass(frozen=True)
-class Choice:
+class WeightChoice:
     """A weight, the field to start from, and the reason for the choice."""
 
     weight: float
@@ -39,7 +39,7 @@ class Choice:
     reason: str
 
 
-def choose_weight(solve: Solve, x: Tensor, noise: float | None = None, guess: float | None = None) -> Choice:
+def choose_weight(solve: Solve, x: Tensor, noise: float | None = None, guess: float | None = None) -> WeightChoice:
     """Return the weight by the discrepancy principle or the L-curve, starting from x.
 
     The noise is its residual |F x - b|^2, None where sigma is not known; the guess is the weight of a coarser grid,
@@ -62,12 +62,12 @@ def choose_weight(solve: Solve, x: Tensor, noise: float | None = None, guess: fl
             break
         decrease = path[-2].residual - path[-1].residual
         if guess is not None and noise is not None and decrease < MIN_DECREASE * (path[-2].residual - noise):
-            return Choice(weights[0], path[0].x, "weight of the coarser grid" + _excess(path[-1], noise))
+            return WeightChoice(weights[0], path[0].x, "weight of the coarser grid" + _excess(path[-1], noise))
     if bend <= 0:
         corner = len(path) - 1 if guess is None else 0
     fallback = "lowest weight of the search" if guess is None else "weight of the coarser grid"
     reason = "corner of the L-curve" if bend > 0 else f"{fallback}, since the L-curve has no corner"
-    return Choice(weights[corner], path[corner].x, reason + _excess(path[-1], noise))
+    return WeightChoice(weights[corner], path[corner].x, reason + _excess(path[-1], noise))
 
 
 def sharpest_corner(points: list[tuple[float, float]]) -> tuple[int, float]:
@@ -97,17 +97,17 @@ def _excess(last: Iterate, noise: float | None) -> str:
     return f" (the residual remains at {ratio:.2f} sigma: sigma too small, or grid too coarse for the flow?)"
 
 
-def _upward(solve: Solve, weight: float, iterate: Iterate, noise: float) -> Choice:
+def _upward(solve: Solve, weight: float, iterate: Iterate, noise: float) -> WeightChoice:
     """Raise the weight until the residual exceeds the noise."""
     while weight < 1e6 * HIGHEST:
         above = solve(weight * FACTOR, iterate.x)
         if above.residual > noise:
             return _between(weight * FACTOR, above, weight, iterate, noise)
         weight, iterate = weight * FACTOR, above
-    return Choice(weight, iterate.x, "highest weight of the search: the signal does not exceed the noise")
+    return WeightChoice(weight, iterate.x, "highest weight of the search: the signal does not exceed the noise")
 
 
-def _between(upper: float, above: Iterate, lower: float, below: Iterate, noise: float) -> Choice:
+def _between(upper: float, above: Iterate, lower: float, below: Iterate, noise: float) -> WeightChoice:
     """Interpolate the residual in logarithms."""
     share = math.log(above.residual / noise) / math.log(above.residual / max(below.residual, 1e-300))
-    return Choice(upper * (lower / upper) ** share, below.x, DISCREPANCY)
+    return WeightChoice(upper * (lower / upper) ** share, below.x, DISCREPANCY)
