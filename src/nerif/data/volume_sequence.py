@@ -6,7 +6,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from nerif.common.conventions import InputError, ambient_index
 from nerif.common.files import atomic
@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     import zarr
 
 __all__ = ["FIELDS", "StoredViewScores", "VolumeSequence", "score_names"]
+
+Store = TypeVar("Store", bound="VolumeSequence")
 
 FIELDS = ("fields over time", "box_lower_mm")
 """Content of such a store, and an attribute that marks it."""
@@ -95,14 +97,14 @@ class VolumeSequence:
 
     @classmethod
     def create(
-        cls,
+        cls: type[Store],
         path: Path,
         times: Sequence[float],
         grid: Grid,
         quantities: Sequence[str],
         n_ambient: float,
         attributes: Mapping[str, Any] | None = None,
-    ) -> VolumeSequence:
+    ) -> Store:
         """Make an empty store in place of an earlier one.
 
         Parameters
