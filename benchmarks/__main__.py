@@ -61,7 +61,7 @@ def run(name: str, options: argparse.Namespace, data: Path) -> bool:
         raise InputError(f"expected a folder, got the file {out}", field="out")
     records = runner.run(name, cases, path, data, options.resume, options.against)
     blocks = runner.comparison(records) if options.against else runner.blocks_of(module, records)
-    print("\n\n".join(blocks), flush=True)
+    print("\n\n".join(block for block in blocks if isinstance(block, str)), flush=True)
     if path:
         print(f"\n{path.with_suffix('.md')}")
     return not any("failed" in record and "unavailable" not in record for record in records)
@@ -84,8 +84,7 @@ def main(arguments: list[str] | None = None) -> int:
                     raise InputError(
                         f"no records in {path.with_suffix('.jsonl')}; run it with --write or --out", field=name
                     )
-                cases = runner.select(runner.benchmark(name), options.quick)
-                print(runner.write_page(name, path, cases, records))
+                print(runner.write_page(name, path, records))
         else:
             with tempfile.TemporaryDirectory() as temporary:
                 data = options.data or Path(temporary)

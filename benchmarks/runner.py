@@ -6,8 +6,8 @@
     COLUMNS                            heading: format string over settings and metrics, such as "{l2:.2%}"
 
 and, where needed, `derive(rows)` (adds values computed from several rows, such as ratios), `notes(rows)` (text below
-the table), `blocks(rows)` (Markdown blocks instead of the table), `write_page(path, cases, records)` (the whole
-page). Cases that differ only in "seed" share a row of medians.
+the table), `blocks(rows)` (blocks of Markdown, and figures, instead of the table). Cases that differ only in "seed"
+share a row of medians.
 """
 
 from __future__ import annotations
@@ -28,8 +28,9 @@ import tempfile
 import threading
 import time
 import traceback
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
 from types import ModuleType
@@ -39,6 +40,8 @@ import torch
 
 from nerif import __version__
 from nerif.common.conventions import InputError
+from nerif.common.files import atomic
+from nerif.plotting.drawing import style
 from nerif.reconstruction.device import keep_freed_memory
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -63,6 +66,36 @@ PRELOADED = [
 Settings = dict[str, Any]
 Record = dict[str, Any]
 """settings, metrics (or failed: the reason), and the origin: commit, nerif, torch, machine, date."""
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A figure among the blocks of a page.
+
+    Parameters
+    ----------
+    name : of its file, figures/NAME.svg
+    size : width and height, inches
+    draw : draws into an empty matplotlib figure
+    """
+
+    name: str
+    caption: str
+    size: tuple[float, float]
+    draw: Callable[[Any], None]
+
+    def write(self, folder: Path) -> str:
+        """Write the figure, letters as outlines, so that it looks the same everywhere; return it as Markdown."""
+        import matplotlib as mpl
+        from matplotlib.figure import Figure as Canvas
+
+        path = folder / "figures" / f"{self.name}.svg"
+        path.parent.mkdir(exist_ok=True)
+        with style(10), mpl.rc_context({"svg.fonttype": "path", "svg.hashsalt": self.name}), atomic(path) as part:
+            figure = Canvas(figsize=self.size, layout="constrained")
+            self.draw(figure)
+            figure.savefig(part, format="svg", metadata={"Date": None, "Creator": None, "Title": self.caption})
+        return f"![{self.caption}](figures/{path.name})\n\n*{self.caption}*"
 
 
 class Unavailable(Exception):
@@ -191,6 +224,11 @@ def table(columns: Sequence[str], rows: Iterable[Sequence[str]], left: int | Non
     return "\n".join("| " + " | ".join(cells) + " |" for cells in (columns, rule, *rows))
 
 
+def literal(text: object) -> str:
+    """Return text in one line, as a cell of a table."""
+    return " ".join(str(text).split()).replace("|", "\\|")
+
+
 def cells(columns: Mapping[str, str], row: Mapping[str, Any]) -> list[str]:
     """Return the cells of a row; a dash for a missing value, the first of them with the reason of a failure."""
 
@@ -202,12 +240,12 @@ def cells(columns: Mapping[str, str], row: Mapping[str, Any]) -> list[str]:
 
     texts = [cell(form) for form in columns.values()]
     if "failed" in row and "–" in texts:
-        texts[texts.index("–")] = " ".join(str(row["failed"]).split()).replace("|", "\\|")
+        texts[texts.index("–")] = literal(row["failed"])
     return texts
 
 
-def blocks_of(module: ModuleType, records: Sequence[Record]) -> list[str]:
-    """Return the results of a benchmark as blocks of Markdown."""
+def blocks_of(module: ModuleType, records: Sequence[Record]) -> list[str | Figure]:
+    """Return the results of a benchmark as blocks of Markdown and figures."""
     rows = rows_of(records)
     if hasattr(module, "derive"):
         module.derive(rows)
@@ -220,7 +258,7 @@ def blocks_of(module: ModuleType, records: Sequence[Record]) -> list[str]:
 ORIGIN = {"commit": "Commit", "nerif": "nerif", "torch": "PyTorch", "machine": "Machine", "date": "Date"}
 
 
-def origins(records: Iterable[Record], name: str = "case") -> str:
+def origins(records: Iterable[Record]) -> str:
     """Return a table of where, when and by which commit the records were made."""
     counts: dict[tuple[str, ...], list[str]] = {}
     for record in records:
@@ -229,19 +267,18 @@ def origins(records: Iterable[Record], name: str = "case") -> str:
     all_cases = len(counts) == 1
     last = [f"all {len(k)}" if all_cases else ", ".join(k) if all(k) else str(len(k)) for k in counts.values()]
     rows = [[*made, text] for made, text in zip(counts, last, strict=True)]
-    return table([*ORIGIN.values(), f"{name.capitalize()}s"], rows)
+    return table([*ORIGIN.values(), "Cases"], rows)
 
 
-def write_page(name: str, path: Path, cases: Sequence[Settings], records: Sequence[Record]) -> Path:
-    """Write the page of a benchmark from its records."""
+def write_page(name: str, path: Path, records: Sequence[Record]) -> Path:
+    """Write the page of a benchmark, and its figures, from its records."""
     module = benchmark(name)
-    if hasattr(module, "write_page"):
-        return Path(module.write_page(path, cases, latest(records)))
     head, _, text = (module.__doc__ or "").partition("\n")
     quick = " --quick" if path.stem.endswith("-quick") else ""
     command = f"Command: `python -m benchmarks run {name}{quick}`"
     blocks = [f"# {head.rstrip('.')}", text.strip(), command, *blocks_of(module, records), origins(latest(records))]
-    path.write_text("\n\n".join(block for block in blocks if block) + "\n", encoding="utf-8")
+    texts = [block.write(path.parent) if isinstance(block, Figure) else block for block in blocks]
+    path.write_text("\n\n".join(filter(None, texts)) + "\n", encoding="utf-8")
     return path
 
 
@@ -285,11 +322,11 @@ def run(
                         append(path, record)
                 results.append(record)
                 if path and time.monotonic() - written > PAGE_SECONDS:
-                    write_page(name, path.with_suffix(".md"), cases, records)
+                    write_page(name, path.with_suffix(".md"), records)
                     written = time.monotonic()
         finally:
             if path and records:
-                write_page(name, path.with_suffix(".md"), cases, records)
+                write_page(name, path.with_suffix(".md"), records)
     return results
 
 

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import dataclasses
-import hashlib
-import json
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any
 
-from benchmarks.runner import N_AMBIENT
 from nerif import __version__
 from nerif.forward.deflection import MODELS
 from nerif.geometry import Box, Ring
 from nerif.reconstruction.device import resolve_device
 from nerif.reconstruction.neural.losses import LossWeights
-from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.neural.presets import PRESETS, preset
 from nerif.reconstruction.reconstructor import Reconstructor
 from nerif.reconstruction.voxels.landweber import Landweber
@@ -42,8 +38,6 @@ PHANTOMS = ("1", "2", "3", "4", "5", "6", "7")
 NOISES = (0.0, 0.1, 0.15)
 METHODS = ("NeRIF", "Tikhonov", "Landweber", "TV")
 BOX = Box.cube(50.0)
-NOISE_SEED = 1
-EQUAL = ((24, 48), 10)  # samples and their jitter in equal intervals
 
 
 @dataclass(frozen=True)
@@ -103,23 +97,10 @@ class Case:
     snapshots: bool = False
 
     @property
-    def data_key(self) -> str:
-        """Name of the simulated measurement without noise, with a hash of all that determines it."""
-        ring = dataclasses.asdict(self.ring)
-        return f"phantom{self.phantom}-{self.ring.views}views-" + _hash(
-            [self.phantom, ring, dataclasses.asdict(BOX), N_AMBIENT, __version__]
-        )
-
-    @property
-    def digest(self) -> str:
-        """Hash of all inputs of the reconstruction."""
-        inputs = dataclasses.asdict(self) | {"box": dataclasses.asdict(BOX), "n_ambient": N_AMBIENT, "seed": NOISE_SEED}
-        del inputs["labels"], inputs["key"]
-        return _hash(inputs)
-
-
-def _hash(value: Any) -> str:
-    return hashlib.sha256(json.dumps(value).encode()).hexdigest()[:12]
+    def data_name(self) -> str:
+        """Name of the simulated measurement without noise."""
+        ring = self.ring
+        return f"{self.phantom}-{ring.views}views-{ring.arc[1]:g}deg-{ring.image_size[0]}px-{__version__}.nc"
 
 
 def study_cases(scale: Scale) -> list[Case]:
@@ -132,28 +113,33 @@ def study_cases(scale: Scale) -> list[Case]:
     return list(cases.values())
 
 
-def nerif(scale: Scale) -> NeRIF:
-    """Return NeRIF with the limits of the study."""
+def section_keys(scale: Scale, section: str) -> dict[str, str]:
+    """Return the keys of the cases of a section by label, in the section's order."""
+    return {case.labels[section]: case.key for case in _all(scale) if section in case.labels}
+
+
+@cache
+def _all(scale: Scale) -> tuple[Case, ...]:
+    return tuple(_by_section(scale))
+
+
+def _by_section(scale: Scale) -> Iterator[Case]:
+    ring = Ring(image_size=(scale.pixels,) * 2, pixel_pitch=0.02 * 200 / scale.pixels)
     base = preset(scale.preset)
     limits: dict[str, Any] = {"time_limit": scale.seconds, "max_steps": scale.steps, "epochs": 0}
-    return replace(base, **limits, points_per_batch=scale.points or base.points_per_batch, device=scale.device)
-
-
-def _all(scale: Scale) -> Iterator[Case]:
-    ring = Ring(image_size=(scale.pixels,) * 2, pixel_pitch=0.02 * 200 / scale.pixels)
-    base = nerif(scale)
+    base = replace(base, **limits, points_per_batch=scale.points or base.points_per_batch, device=scale.device)
 
     def case(key: str, labels: dict[str, str], reconstructor: Reconstructor, **more: Any) -> Case:
         values = {"phantom": "2", "noise": 0.1, "method": "NeRIF", "ring": ring, "truth_voxels": scale.truth_voxels}
         return Case(key=key, labels=labels, reconstructor=reconstructor, **{**values, **more})
 
-    tikhonov = Tikhonov(voxels=scale.voxels, basis="linear", device=scale.device)
-    for name, method in {
+    methods: dict[str, Reconstructor] = {
         "NeRIF": base,
-        "Tikhonov": tikhonov,
+        "Tikhonov": Tikhonov(voxels=scale.voxels, basis="linear", device=scale.device),
         "Landweber": Landweber(voxels=scale.voxels, basis="linear", device=scale.device),
         "TV": TotalVariation(voxels=scale.tv_voxels, basis=scale.tv_basis, device=scale.device),  # type: ignore[arg-type]
-    }.items():
+    }
+    for name, method in methods.items():
         for phantom in PHANTOMS:
             for noise in NOISES:
                 sections = ("tables", "slices", "cost", *(("curves",) if phantom == "2" else ()))
@@ -163,16 +149,15 @@ def _all(scale: Scale) -> Iterator[Case]:
                 )  # fmt: skip
 
     # each section below changes one thing of NeRIF as it stands in the tables; most of them on Phantom 2 at noise 0.1
-    as_is = "2-0.1-nerif"
-    yield case(as_is, {"differentiation": "exact gradient (automatic)"}, base)
+    as_is, exact = "2-0.1-nerif", "2-0-nerif"
     numerical = LossWeights(numerical=1, automatic=0)
-    central = replace(base, weights=numerical)
-    yield case("numerical", {"differentiation": "central differences (numerical)"}, central)
-    plain, heads = replace(base.network, head_width=0, gradient_head=False), replace(base.network, head_width=64)
-    key = as_is if plain == base.network else "plain"
-    yield case(key, {"network": "plain"}, replace(base, network=plain))
-    yield case("multi-head", {"network": "multi-head, without gradient head"}, replace(base, network=heads))
     three = LossWeights(consistency=1, numerical=1, head=1, automatic=0)
+    plain, heads = replace(base.network, head_width=0, gradient_head=False), replace(base.network, head_width=64)
+    yield case(as_is, {"differentiation": "exact gradient (automatic)"}, base)
+    central = {"differentiation": "central differences (numerical)"}
+    yield case("numerical", central, replace(base, weights=numerical))
+    yield case(as_is if plain == base.network else "plain", {"network": "plain"}, replace(base, network=plain))
+    yield case("multi-head", {"network": "multi-head, without gradient head"}, replace(base, network=heads))
     gradient = replace(base, network=replace(heads, gradient_head=True), weights=three)
     yield case("gradient-head", {"network": "multi-head, with gradient head (the paper's)"}, gradient)
 
@@ -186,42 +171,33 @@ def _all(scale: Scale) -> Iterator[Case]:
         yield case(key, {"sampling": sampling}, replace(base, sampling=sampling))
 
     for i, model in enumerate(MODELS):  # the first is what auto stands for
-        key, changed = (f"model-{model}", replace(base, model=model)) if i else ("2-0-nerif", base)
+        key, changed = (f"model-{model}", replace(base, model=model)) if i else (exact, base)
         yield case(key, {"model": model}, changed, noise=0.0)
 
-    for name, reconstructor in {"NeRIF": base, "Tikhonov": tikhonov}.items():
+    for name in ("NeRIF", "Tikhonov"):
         octahedron = {"phantom": "octahedron", "noise": 0.0, "method": name}
-        yield case(f"octahedron-{name.lower()}", {"resolution": name}, reconstructor, **octahedron)
+        yield case(f"octahedron-{name.lower()}", {"resolution": name}, methods[name], **octahedron)
 
     for views in scale.views:
         half_circle = replace(ring, views=views, arc=(0.0, 180.0 - 180.0 / views))
         yield case(f"views-{views}", {"views": str(views)}, base, ring=half_circle)
 
-    for label, variant in variants(base, resolve_device(scale.device).type == "cuda").items():
-        key = "2-0-nerif" if variant == base else f"speed-{label.replace(' ', '-')}"
-        yield case(key, {"speed": label}, variant, noise=0.0, snapshots=True)
-
-
-def variants(base: NeRIF, gpu: bool) -> dict[str, NeRIF]:
-    """Return the settings whose speed is compared: one choice reversed each, and on a GPU the presets (a step of the
-    larger ones takes a CPU ten seconds and more).
-    """
-
-    def limited(settings: NeRIF) -> NeRIF:
-        return replace(settings, time_limit=base.time_limit, epochs=base.epochs, device=base.device, stop_ratio=0.0)
-
-    network, (samples, jitter) = base.network, EQUAL
-    equal = replace(base, sampling="shifted", samples=samples, sample_jitter=jitter)
-    return {
-        "as it is": base,
-        **({f"preset {name}": limited(settings) for name, settings in PRESETS.items()} if gpu else {}),
+    equal = replace(base, sampling="shifted", samples=(24, 48), sample_jitter=10)  # in equal intervals
+    width, batch = base.network.width, base.points_per_batch
+    variants = {
         "Adam": replace(base, optimiser="adam"),
         "equal intervals": equal,
         "Adam and equal intervals": replace(equal, optimiser="adam"),
-        "central differences": replace(base, weights=LossWeights(numerical=1, automatic=0)),
+        "central differences": replace(base, weights=numerical),
         "mean length of residuals": replace(base, norm="l2"),
         "float32": replace(base, precision="float32"),
-        "half the width": replace(base, network=replace(network, width=network.width // 2)),
-        "twice the width": replace(base, network=replace(network, width=2 * network.width)),
-        "half the batch": replace(base, points_per_batch=base.points_per_batch // 2),
+        "half the width": replace(base, network=replace(base.network, width=width // 2)),
+        "twice the width": replace(base, network=replace(base.network, width=2 * width)),
+        "half the batch": replace(base, points_per_batch=batch // 2),
     }
+    if resolve_device(scale.device).type == "cuda":  # a step of the larger presets takes a CPU ten seconds and more
+        limits = {"time_limit": base.time_limit, "epochs": 0, "device": base.device, "stop_ratio": 0.0}
+        variants = {f"preset {name}": replace(settings, **limits) for name, settings in PRESETS.items()} | variants
+    yield case(exact, {"speed": "as it is"}, base, noise=0.0)
+    for label, variant in variants.items():
+        yield case(f"speed-{label.replace(' ', '-')}", {"speed": label}, variant, noise=0.0, snapshots=True)

@@ -1,143 +1,73 @@
-"""Records of the study by phantom, noise and method, or by section."""
+"""Rows of the study (settings and metrics of a record) by phantom, noise and method, or by section."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from statistics import median
 from typing import Any
 
-from benchmarks.study.plan import NOISES, PHANTOMS, SECTIONS, Case
-from nerif.reconstruction.neural.neural import NeRIF
+from benchmarks.study.plan import NOISES, PHANTOMS, Scale, section_keys
 
-Record = dict[str, Any]
+Row = dict[str, Any]
 Cell = tuple[str, float, str]
 """Phantom, noise and method."""
 
 
 class NoResult(Exception):
-    """A claim or a table needs a result that the study lacks, and why."""
+    """A claim needs a result that the study lacks, and why."""
 
 
-@dataclass(frozen=True)
 class Results:
-    """Cases with their records.
+    """Rows by key; a case without a record has a row with its key alone."""
 
-    Parameters
-    ----------
-    pairs : every case with its record; None where there is none yet
-    sections : of the page
-    """
+    def __init__(self, rows: Sequence[Row], scale: Scale) -> None:
+        self.by_key, self.scale = {row["key"]: row for row in rows}, scale
 
-    pairs: tuple[tuple[Case, Record | None], ...]
-    sections: tuple[str, ...] = tuple(SECTIONS)
+    def row(self, key: str) -> Row:
+        return self.by_key.get(key, {"key": key})
 
-    def __post_init__(self) -> None:
-        pairs = ((case, None if record is None else {**record, "key": case.key}) for case, record in self.pairs)
-        object.__setattr__(self, "pairs", tuple(pairs))
+    def section(self, name: str) -> dict[str, Row]:
+        """Return the rows of a section by label."""
+        return {label: self.row(key) | {"label": label} for label, key in section_keys(self.scale, name).items()}
 
-    @property
-    def done(self) -> int:
-        return sum(record is not None and "failed" not in record for _, record in self.pairs)
-
-    @property
-    def failed(self) -> list[tuple[Case, str]]:
-        """Cases that failed, and why."""
-        return [(case, str(record["failed"])) for case, record in self.pairs if record and "failed" in record]
-
-    def rows(self, section: str) -> list[tuple[str, Case, Record | None]]:
-        """Return label, case and record of a section; None for a failed record."""
-        return [
-            (case.labels[section], case, None if record and "failed" in record else record)
-            for case, record in self._of(section)
-        ]
-
-    def cell(self, phantom: str, noise: float, method: str) -> Record | None:
-        """Return a record of the tables, or None."""
-        records = (record for _, case, record in self.rows("tables") if _cell(case) == (phantom, noise, method))
-        return next(records, None)
-
-    def failed_cell(self, phantom: str, noise: float, method: str) -> bool:
-        """Whether a reconstruction of the tables failed."""
-        return (phantom, noise, method) in [_cell(case) for case, _ in self.failed if "tables" in case.labels]
+    def cell(self, phantom: str, noise: float, method: str) -> Row:
+        """Return a row of the tables."""
+        return self.row(f"{phantom}-{noise:g}-{method.lower()}")
 
     def cells(
         self, methods: Iterable[str], noises: Iterable[float] = NOISES, phantoms: Iterable[str] = PHANTOMS
-    ) -> dict[Cell, Record]:
-        """Return records of the tables by (phantom, noise, method); NoResult where one is missing."""
-        keys = [(p, noise, method) for method in methods for p in phantoms for noise in noises]
-        cases = {_cell(case): (case, record) for case, record in self.pairs if "tables" in case.labels}
-        return dict(zip(keys, self._require([cases.get(key) for key in keys], "tables"), strict=True))
-
-    def one(self, phantom: str, noise: float, method: str) -> Record:
-        """Return one record of the tables; NoResult where it is missing."""
-        return next(iter(self.cells((method,), (noise,), (phantom,)).values()))
-
-    def labelled(self, section: str) -> dict[str, Record]:
-        """Return the records of a section by label; NoResult where one is missing."""
-        pairs = self._of(section)
-        records = self._require(pairs or [None], section)
-        return dict(zip((case.labels[section] for case, _ in pairs), records, strict=True))
-
-    def _of(self, section: str) -> list[tuple[Case, Record | None]]:
-        """Return the pairs of a section, in order where the labels are numbers."""
-        pairs = [(case, record) for case, record in self.pairs if section in case.labels]
-        return sorted(pairs, key=lambda pair: _order(section, pair[0]))
-
-    def _require(self, pairs: Sequence[tuple[Case, Record | None] | None], section: str) -> list[Record]:
-        present = [pair for pair in pairs if pair is not None]
-        records = [record for _, record in present if record is not None and "failed" not in record]
-        if len(records) == len(pairs):
-            return records
-        for case, record in present:
-            if record is not None and "failed" in record:
-                raise NoResult(f"{case.key} failed: {record['failed']}")
-        if len(present) < len(pairs):
-            raise NoResult(f"the section “{SECTIONS[section]}” was left out")
-        if len(pairs) == 1:
-            raise NoResult(f"{present[0][0].key} is not done yet")
-        raise NoResult(f"{len(records)} of {len(pairs)} reconstructions done")
+    ) -> dict[Cell, Row]:
+        """Return rows of the tables by (phantom, noise, method)."""
+        return {(p, noise, m): self.cell(p, noise, m) for m in methods for p in phantoms for noise in noises}
 
 
-def _cell(case: Case) -> Cell:
-    return case.phantom, case.noise, case.method
+def score(row: Row, name: str) -> Any:
+    """Return a metric; NoResult where there is none."""
+    if "failed" in row:
+        raise NoResult(f"{row['key']} failed: {row['failed']}")
+    if "outcome" not in row:
+        raise NoResult(f"{row['key']} is not done")
+    if row.get(name) is None:  # not finite
+        raise NoResult(f"{name} of {row['key']} is not a number (the run ended with: {row['outcome']})")
+    return row[name]
 
 
-def _order(section: str, case: Case) -> int:
-    if section == "views":
-        return case.ring.views
-    return case.reconstructor.network.octaves if section == "encoding" and isinstance(case.reconstructor, NeRIF) else 0
+def scores(rows: Iterable[Row], name: str) -> list[float]:
+    """Return the values of a metric that are there."""
+    return [row[name] for row in rows if row.get(name) is not None]
 
 
-def finite(value: object) -> float | None:
-    """Return a finite number, or None."""
-    return float(value) if isinstance(value, int | float) and math.isfinite(value) else None
+def slice_scores(rows: Iterable[Row], name: str) -> list[float]:
+    """Return a score of all slices of some volumes."""
+    return scores((one for row in rows for one in row.get("slices") or []), name)
 
 
-def metric(record: Record | None, name: str) -> float | None:
-    """Return a metric; None where there is no record, or no number in it."""
-    return None if record is None else finite(record["metrics"].get(name))
+def first_at(row: Row, name: str, level: float | None) -> Row | None:
+    """Return the first point of the curve of a run where a metric is at most `level`, or None."""
+    points = (point for point in row.get("curve") or [] if level is not None and point.get(name) is not None)
+    return next((point for point in points if point[name] <= level), None)
 
 
-def score(record: Record, name: str) -> float:
-    """Return a metric; NoResult where it is not a number, as of a run that diverged."""
-    value = finite(record["metrics"].get(name))
-    if value is None:
-        raise NoResult(f"{name} of {record['key']} is not a number (the run ended with: {record['outcome']})")
-    return value
-
-
-def first_at(record: Record, name: str, level: float) -> dict[str, float] | None:
-    """Return the first point of a record's curve where a metric is at most `level`, or None."""
-    for point in record.get("curve") or []:
-        value = finite(point.get(name))
-        if value is not None and value <= level:
-            return dict(point)
-    return None
-
-
-def typical(records: Iterable[Record], name: str) -> float | None:
-    """Return the median of a value over records; None where there is none."""
-    values = [v for v in (finite(record.get(name)) for record in records) if v is not None]
-    return median(values) if values else None
+def listed(names: Iterable[str]) -> str:
+    """Return names with commas and an "and"."""
+    words = list(names)
+    return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)

@@ -10,8 +10,8 @@ from typing import Any
 import torch
 
 from benchmarks.runner import N_AMBIENT
-from benchmarks.study.plan import BOX, NOISE_SEED, Case
-from benchmarks.study.resolution import measure_resolution, pixels_per_unit, to_plain
+from benchmarks.study.plan import BOX, Case
+from benchmarks.study.resolution import measure_resolution, pixels_per_unit
 from nerif.analysis.evaluation import evaluate_volume
 from nerif.analysis.metrics import volume_errors
 from nerif.common.conventions import InputError
@@ -26,15 +26,20 @@ from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.reconstructor import Reconstruction, State, Step
 from nerif.simulation.simulate import add_noise, simulate
 
+NOISE_SEED = 1
 FORWARD_RAYS, FORWARD_SAMPLES = 4000, 400
 SHARES = (0.03, 0.06, 0.1, 0.15, 0.22, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
 """Of a run, at which its state is captured; errors are computed when the run is over."""
 
 
 def run_case(case: Case, folder: Path) -> dict[str, Any]:
-    """Simulate (or read an earlier simulation), reconstruct, and compare with the truth."""
+    """Simulate (or read an earlier simulation), reconstruct, and compare with the truth.
+
+    The record has the metrics of the volume; time [s], memory [GB] and processor; outcome, steps, epochs and loss at
+    the end; for some cases the curve of the error, the errors of the forward models, the resolution.
+    """
     phantom = make_phantom(case.phantom, BOX)
-    path = folder / f"{case.data_key}.nc"
+    path = folder / case.data_name
     if not path.is_file():
         simulate(phantom, case.ring.cameras(), BOX, N_AMBIENT).write(path)
     measurement = add_noise(Measurement.read(path), case.noise, NOISE_SEED)
@@ -53,19 +58,17 @@ def run_case(case: Case, folder: Path) -> dict[str, Any]:
     truth = Volume(phantom.sample(grid), grid)
     last = result.history[-1]
     record = {
-        "phantom": case.phantom, "noise": case.noise, "method": case.method, "views": case.ring.views,
-        "metrics": evaluate_volume(result.field, truth, N_AMBIENT, result.device), "seconds": result.seconds,
-        "peak_memory_bytes": result.peak_memory_bytes, "device": result.device, "outcome": result.outcome.reason,
-        "steps": last.get("step"), "epochs": last.get("epoch"), "loss": last.get("loss"),
+        **evaluate_volume(result.field, truth, N_AMBIENT, result.device), "time": result.seconds,
+        "memory": result.peak_memory_bytes / 1e9, "processor": result.device, "outcome": result.outcome.reason,
+        "steps": last.get("step"), "epochs": last.get("epoch"), "loss": last.get("loss"), "views": case.ring.views,
     }  # fmt: skip
     if case.snapshots:
         rays = len(measurement.rays()[0])
-        states = [*_earlier(case, measurement, snapshots), result]
-        record["curve"] = [_point(state, truth, rays) for state in states]
+        record["curve"] = [_point(state, truth, rays) for state in [*_earlier(case, measurement, snapshots), result]]
     if case.labels.get("model") == "lever_arm":
         record["forward"] = _forward_models(phantom, measurement)
     if isinstance(phantom, Octahedron):
-        record["resolution"] = to_plain(measure_resolution(result.field, phantom, device=result.device))
+        record["resolution"] = measure_resolution(result.field, phantom, result.device)
         record["pixels_per_unit"] = pixels_per_unit(measurement.cameras[0], phantom)
     return record
 
@@ -98,7 +101,7 @@ def _point(result: Reconstruction, truth: Volume, rays: int) -> dict[str, float]
     values = result.field.sample(truth.grid, result.device).numpy()
     return {
         "step": float(schedule["step"]),
-        "epoch": schedule["rays_done"] / rays,
+        "epochs": schedule["rays_done"] / rays,
         "seconds": float(schedule["seconds"]),
         "loss": result.history[-1].get("loss", float("nan")),
         **volume_errors(truth.values.numpy(), values, N_AMBIENT),
