@@ -1,4 +1,4 @@
-"""The error up to a rigid motion of the field, which no camera can detect if the whole rig moves along."""
+"""Error of a field after its best rigid motion onto the truth: a motion of rig and field together is undetectable."""
 
 from __future__ import annotations
 

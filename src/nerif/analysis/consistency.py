@@ -448,7 +448,7 @@ OF_VECTORS = (
     Change("quarter_turn", QUARTER, _vectors_of(lambda d: d.rot90(1, (0, 1)), 1, -1), square=True),
     Change("quarter_turn", QUARTER, _vectors_of(lambda d: d.rot90(-1, (0, 1)), -1, 1), square=True),
 )
-"""Of maps with two components in the image."""
+"""Changes of maps with two components in the image."""
 
 OF_SCALARS = (
     Change("mirrored", MIRRORED, lambda d: d.flip(1), MIRRORED),
@@ -458,10 +458,10 @@ OF_SCALARS = (
     Change("quarter_turn", QUARTER, lambda d: d.rot90(1, (0, 1)), square=True),
     Change("quarter_turn", QUARTER, lambda d: d.rot90(-1, (0, 1)), square=True),
 )
-"""Of maps with one value per pixel."""
+"""Changes of maps with one value per pixel."""
 
 SIGN = Change("flipped", "the sign is flipped", lambda d: -d)
-"""Of one value per pixel that may be negative; undetectable in all views at once."""
+"""Change of one value per pixel that may be negative; undetectable in all views at once."""
 
 
 @dataclass(frozen=True)

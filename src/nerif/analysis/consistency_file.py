@@ -1,4 +1,4 @@
-"""The findings of a check in a file (JSON): of every view its agreement, then faults, remarks, and the remedy."""
+"""The findings of `nerif check` as JSON: agreement of every view, faults, remarks and the remedy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Flow that is wider than the images: the signal does not fall to zero at an edge beyond which the box continues.
+"""Flow cut by the edge of an image: the signal does not fall to zero at an edge beyond which the box continues.
 
 What lies beyond an edge of one view deflects the rays of the others, but is not in its image: the views then determine
 neither the field nor whether they agree. An edge that cuts all views in the same plane, as above a jet, does no harm.

@@ -1,4 +1,4 @@
-"""Prediction of the views that cameras take of a field."""
+"""Predicted measurements of a field by given cameras."""
 
 from __future__ import annotations
 

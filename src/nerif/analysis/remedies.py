@@ -1,4 +1,4 @@
-"""What a verdict and a report may advise: causes of correlated residuals with their remedies, and longer runs.
+"""Remedies in verdicts and reports: for causes of correlated residuals, and a longer run.
 
 A remedy names the setting of a run by which it is in use, and is not advised to that run. A cause whose parameters are
 fitted together with the field, such as a wrong pose under --refine cameras, does not explain the residual of that fit,

@@ -1,4 +1,4 @@
-"""Volumes on the grid of another, for differences and comparison."""
+"""Resampling of a volume onto the grid of another, for differences and comparison."""
 
 from __future__ import annotations
 

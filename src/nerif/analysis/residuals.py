@@ -1,4 +1,4 @@
-"""Test of the residual of a view: is it white, and if not, which known cause leaves such a pattern?
+"""Whiteness test of the residual of a view, and the known cause whose pattern explains a correlated one.
 
     z_b = sum_{p in b} r_p / sqrt(n_b s^2),    s^2 = mean r^2,    grain = sqrt(mean z_b^2)
 

@@ -1,4 +1,4 @@
-"""The verdict on a velocity: residuals of the equations, standard deviations, where it is known, how the fit ended."""
+"""The verdict on a velocity: residuals of the equations, standard deviations, determined region, outcome of the fit."""
 
 from __future__ import annotations
 

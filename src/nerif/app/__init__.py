@@ -1,1 +1,1 @@
-"""The whole road in a browser, on the lab's own machine: `nerif app`."""
+"""All steps from design to results in a browser, on the user's own machine: `nerif app`."""

@@ -1,4 +1,4 @@
-"""Callbacks between two pieces of long work, in the thread that does the work."""
+"""Callbacks during a long computation, called in its own thread."""
 
 from __future__ import annotations
 

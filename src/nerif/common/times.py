@@ -1,4 +1,4 @@
-"""Times of frames in files, in the units of the CF conventions, and what they say about frames that are missing."""
+"""Times of frames in files, in the units of the CF conventions, and missing frames by gaps between them."""
 
 from __future__ import annotations
 

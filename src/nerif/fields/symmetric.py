@@ -115,7 +115,7 @@ class SymmetricVoxels(Field):
 
     @property
     def grid(self) -> Grid:
-        """Of (r, k, h)."""
+        """Grid over (r, k, h)."""
         flat = self.parts[0].grid
         return Grid(flat.box, (flat.shape[0], len(self.parts), flat.shape[2]))
 

@@ -1,4 +1,4 @@
-"""A network that knows the surfaces of bodies: what is on one side of a thin plate has nothing to do with the other.
+"""A network with the surfaces of bodies: the field may differ on the two sides of a thin plate.
 
 Among the inputs of its first layer is the direction from the nearest surface, which fades with the distance d:
 

@@ -1,4 +1,4 @@
-"""A scalar between two frames, carried there by the velocity.
+"""Interpolation of a scalar between two frames, advected by the velocity.
 
 theta(x, t) = (1 - s) theta_0(x - s dt u) + s theta_1(x + (1 - s) dt u),      t = t_0 + s dt
 """

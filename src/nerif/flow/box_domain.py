@@ -1,4 +1,4 @@
-"""Where the velocity of a film is computed, and its values in space: in the whole box, or in the plane of an axis.
+"""The domain of a velocity computation: the whole box, or the meridional plane of an axisymmetric flow.
 
 An axisymmetric flow without swirl is known from one plane through its axis, (r, z).
 """

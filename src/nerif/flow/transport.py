@@ -1,4 +1,4 @@
-"""How well velocities explain that a scalar is carried along: the residual of its transport.
+"""The residual of the transport equation of a scalar, for a given velocity.
 
     r = theta_(k+1)(x + u dt / 2) - theta_k(x - u dt / 2) - dt (Dtheta/Dt)
 

@@ -1,4 +1,4 @@
-"""The velocity of a flow that moves as a whole, by correlation of consecutive frames."""
+"""The convection velocity of a flow, by correlation of consecutive frames."""
 
 from __future__ import annotations
 

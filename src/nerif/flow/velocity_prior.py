@@ -1,4 +1,4 @@
-"""What is assumed of a velocity before the film is analysed: vorticity where the density varies.
+"""The Gaussian prior of a velocity: vorticity where the density varies.
 
     w(x, t) = a(x, t) F^-1 [S(k) F z],      a ~ |grad theta|,      S = (1 + (k L / 2 pi)^2)^-1
 

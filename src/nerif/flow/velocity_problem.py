@@ -1,4 +1,4 @@
-"""The velocity of a film on one grid: controls of the vorticity to flow, residual and objective, and its minimum."""
+"""The velocity of a film on one grid, as a minimisation: from vorticity variables to flow, residuals and objective."""
 
 from __future__ import annotations
 

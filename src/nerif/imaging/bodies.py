@@ -1,4 +1,4 @@
-"""Bodies in a measurement or a film: the pixels that they hide, and whether the data agree with their place."""
+"""Bodies in a measurement or a film: the pixels that they hide, and whether the data agree with their position."""
 
 from __future__ import annotations
 

@@ -47,7 +47,7 @@ class Background:
     fill: Annotated[float, Gt(0), Le(0.6)] = 0.35
     """Share of the paper covered by dots."""
     seed: int = 0
-    """Of the pattern; different for each camera."""
+    """Seed of the pattern; different for each camera."""
 
     def __post_init__(self) -> None:
         check_settings(self)

@@ -1,4 +1,4 @@
-"""The gauge: where the field is known, which fixes the constant that displacements leave undetermined.
+"""The gauge: a region of ambient index, which fixes the constant that displacements leave undetermined.
 
 By default the field is ambient, 0, on the side faces of the box and, with flow masks, outside the visual hull; never
 within a body. A region of the box may be ambient as well, and the index may be known at single points, by probes.

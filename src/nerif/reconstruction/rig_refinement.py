@@ -1,4 +1,4 @@
-"""A rig refined together with the field: poses and focal lengths of cameras, distance of backgrounds, shifts of images.
+"""Refinement of a rig with the field: poses and focal lengths of cameras, distance of backgrounds, shifts of images.
 
     d = A(theta_v) f + c_v + C_v x        theta_v: corrections of camera v (geometry/pose.py), x in the image
     min  sum |d - measured|^2 / sigma^2 + sum theta^2 / sigma_theta^2

@@ -1,4 +1,4 @@
-"""`report.html` of a velocity: arrows, streamlines and vorticity, the speed in 3-D over time, and what it is worth."""
+"""`report.html` of a velocity: arrows, streamlines and vorticity, the speed in 3-D over time, and the verdict."""
 
 from __future__ import annotations
 

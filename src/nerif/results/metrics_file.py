@@ -34,10 +34,10 @@ class ResidualTest(TypedDict):
     cause: str
     """Whose pattern it has (remedies.CAUSES), or empty."""
     share: float
-    """Of the correlated part that the cause explains."""
+    """Fraction of the correlated part that the cause explains."""
     row: float
     column: float
-    """Of its largest part, px."""
+    """Position of its largest part, px."""
     correlated: float
     """The spatially correlated part over the rms."""
 
@@ -50,13 +50,13 @@ class ViewScores(TypedDict):
     measured: str
     """The quantity."""
     unit: str
-    """Of all rms values."""
+    """Unit of all rms values."""
     cc: Score
     ssim: Score
     psnr: Score
     """dB."""
     rms: Score
-    """Of the residual."""
+    """rms of the residual."""
     pixels: int
     rms_predicted: Score
     rms_measured: Score
@@ -89,9 +89,9 @@ class WithheldRun(TypedDict):
     """Cross-validation: the first run, without one view."""
 
     views: list[ViewScores]
-    """Of the withheld view."""
+    """Scores of the withheld view."""
     fitted_views: list[ViewScores]
-    """Of one of the others."""
+    """Scores of one of the others."""
     seconds: float
 
 
@@ -191,7 +191,7 @@ class Metrics:
     measurement: str | None = None
     """File of the views, absolute path."""
     seconds: float | None = None
-    """Of the main run."""
+    """Duration of the main run."""
     peak_memory_bytes: int | None = None
     """Tensors on a GPU, the whole process on a CPU."""
     device: str | None = None
@@ -221,7 +221,7 @@ class Metrics:
     truth: str | None = None
     """File of the true field, absolute path."""
     quantity: str | None = None
-    """Of the field that was compared with it."""
+    """Quantity of the field that was compared with it."""
     l2: Score | None = None
     l2_variation: Score | None = None
     cc: Score | None = None

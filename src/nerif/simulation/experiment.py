@@ -69,7 +69,7 @@ class Experiment:
     backgrounds: int = 5
     """Images of the target on each background."""
     seed: int = 0
-    """Of patterns, poses and noise."""
+    """Seed of patterns, poses and noise."""
 
     def write(
         self, folder: Path, cameras: Sequence[Camera], phantom: Field, box: Box, n_ambient: float,

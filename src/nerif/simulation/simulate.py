@@ -171,7 +171,7 @@ class Simulation:
     counts: Finite = 0.0
     """Detected quanta, for shot noise instead: without the medium (absorption) or where it is brightest."""
     seed: int = 0
-    """Of phantom and noise."""
+    """Seed of phantom and noise."""
     time: float = 0.0
     """Instant of the flame, s."""
     box: tuple[float, float, float] = (50.0, 50.0, 50.0)

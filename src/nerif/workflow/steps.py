@@ -63,7 +63,7 @@ class PipelineStep(ABC):
     @staticmethod
     @abstractmethod
     def run(job: Job) -> None:
-        """Do it."""
+        """Run the step and store its results in the job."""
 
 
 class CrossValidate(PipelineStep):

@@ -1,4 +1,4 @@
-"""Which target is in images where the one of the settings is not detected, or why none is.
+"""Diagnosis of images in which the calibration target is not detected: another target, or the reason.
 
 Tried in this order: ChArUco boards with the dictionaries of OpenCV, as they are and mirrored, chessboards of other
 numbers of squares, and grids of dots. A board is named if its markers lie where a board of that size has them.

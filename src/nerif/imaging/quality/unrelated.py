@@ -1,4 +1,4 @@
-"""Flow images that do not show the scene of their references: exchanged views, another run, a single bad image."""
+"""Flow images of another scene than their references: exchanged views, another run, a single bad image."""
 
 from __future__ import annotations
 

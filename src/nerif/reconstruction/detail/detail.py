@@ -1,4 +1,4 @@
-"""The detail that a reconstruction leaves in its data: the posterior mean of a Gaussian field around it.
+"""Fine detail added to a smooth reconstruction: the posterior mean of a Gaussian field, given the residuals.
 
     x = m + a h
 
@@ -57,9 +57,9 @@ MEAN_WIDTH = 0.04  # standard deviation of the Gaussian that blurs the reconstru
 SLOPE_WIDTH, DETAIL_WIDTH = 0.07, 0.04  # of the Gaussians for the local rms of grad q and of a h
 FLOOR = 0.05  # of the largest a
 ITERATIONS, CONVERGED = 30, 0.03
-"""Of conjugate gradients, at most, and the relative fall of the objective at which they end (docs/decisions/057)."""
+"""Most iterations of conjugate gradients, and the relative fall of the objective at which they end (docs/decisions/057)."""
 TRIAL_ITERATIONS = 6
-"""Of a trial: the coarse grid predicts no better with more, which fit what it cannot represent."""
+"""Iterations of a trial: the coarse grid predicts no better with more, which fit what it cannot represent."""
 DRAW_ITERATIONS, DRAWS = 12, 3  # DRAWS: for the size of the error of a prediction
 SIGNIFICANT, EARLY = 1.1, 3.0  # sigma: residual above which there is detail; in a short run, which has not converged
 EXPLAINED = 0.7  # of the signal of the field's own detail

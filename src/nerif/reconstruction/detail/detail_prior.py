@@ -1,4 +1,4 @@
-"""A Gaussian prior of detail whose size varies in space, and its posterior.
+"""A Gaussian prior of fine detail with a standard deviation that varies in space, and its posterior.
 
     x = a h,   h = F^-1 S^(1/2) F z,   S ~ (k^2 + 1 / L^2)^(-11/6)
 

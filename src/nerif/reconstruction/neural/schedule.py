@@ -1,4 +1,4 @@
-"""The course of a training: its limits, its cycles up to convergence, learning rates and bins of pixels.
+"""The schedule of a training: its limits, cycles until convergence, learning rates and bins of pixels.
 
 Cycles. A run without a limit consists of cycles, each twice as long as the one before. Each ends at the smallest
 learning rate, so that the ends can be compared. With e the mean square of the residual over sigma on withheld pixels,

@@ -1,4 +1,4 @@
-"""Total variation: smooth regions stay smooth and fronts stay sharp.
+"""Total-variation regularisation: smooth regions with sharp fronts.
 
 min_x  |F x - b|^2 + weight mean sqrt(|edge grad x|^2 + softness^2)
 """

@@ -1,4 +1,4 @@
-"""The regularisation weight, chosen from the data on the way down from a weight that smooths too much.
+"""Choice of the regularisation weight from the data, from a weight that smooths too much downwards.
 
 discrepancy   where sigma is known: the weight at which the residual equals the noise, mean (r / sigma)^2 = 1
 L-curve       otherwise, or where the grid cannot resolve the data to the noise: the corner of log residual against log

@@ -1,4 +1,4 @@
-"""Settings of a sequence, and what every worker needs to reconstruct its frames."""
+"""Settings of a sequence, and the inputs of every worker."""
 
 from __future__ import annotations
 

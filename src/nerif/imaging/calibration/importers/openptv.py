@@ -31,7 +31,7 @@ __all__ = ["ORI", "read_openptv"]
 ORI = ".ori"
 MOST = 0.05  # px, by which OpenCV's distortion may differ
 PLACES = ("../parameters/ptv.par", "parameters/ptv.par", "ptv.par", "../ptv.par")
-"""Of the parameters of the sensor, from the folder of the cameras."""
+"""Paths of the parameters of the sensor, from the folder of the cameras."""
 
 Points = Float[np.ndarray, "n 2"]
 
