@@ -57,7 +57,7 @@ MEAN_WIDTH = 0.04  # standard deviation of the Gaussian that blurs the reconstru
 SLOPE_WIDTH, DETAIL_WIDTH = 0.07, 0.04  # of the Gaussians for the local rms of grad q and of a h
 FLOOR = 0.05  # of the largest a
 ITERATIONS, CONVERGED = 30, 0.03
-"""Most iterations of conjugate gradients, and the relative fall of the objective at which they end (docs/decisions/057)."""
+"""Most iterations of conjugate gradients, and the relative fall of the objective at their end (docs/decisions/057)."""
 TRIAL_ITERATIONS = 6
 """Iterations of a trial: the coarse grid predicts no better with more, which fit what it cannot represent."""
 DRAW_ITERATIONS, DRAWS = 12, 3  # DRAWS: for the size of the error of a prediction

@@ -19,7 +19,7 @@ from nerif.geometry import Box, Grid
 __all__ = ["DIAMETER", "Particles", "quality_factor", "spread"]
 
 DIAMETER = 3.0
-"""Diameter of a particle image in px, and of a particle of the ideal volume in voxels: four standard deviations (1/e^2)."""
+"""Diameter of a particle image, px, and of a particle of the ideal volume, voxels: four standard deviations (1/e^2)."""
 
 QUANTITY = "emission"
 REACH = 5.0  # standard deviations at which a Gaussian is truncated
