@@ -22,7 +22,7 @@ from nerif.fields.network import NetworkShape
 from nerif.fields.phantoms import GaussianBalls
 from nerif.fields.voxel_field import VoxelField
 from nerif.forward.deflection import LeverArm
-from nerif.forward.images import Images, References
+from nerif.forward.images import GUESS, Images, References
 from nerif.forward.interferometry import Interferometry
 from nerif.forward.registry import forward_model
 from nerif.geometry import Box, Grid, Ring
@@ -164,7 +164,7 @@ def test_the_residual_of_the_truth_is_noise(taken, d):
 
 def test_the_linear_model_is_the_slope_of_the_displaced_one(taken):
     guessed = of_source(taken, "images", 0.0)
-    guessed = replace(guessed, maps={**guessed.maps, Images.guess: torch.full((*guessed.shape, 2), 0.3)})
+    guessed = replace(guessed, maps={**guessed.maps, GUESS: torch.full((*guessed.shape, 2), 0.3)})
     rays, values, _ = guessed.rays()
     inner = ((rays.pixel - 20).abs() < 14).all(dim=-1)
     rays, values = rays[inner], values[inner]
@@ -260,7 +260,7 @@ def test_images_follow_displacements(balls, taken, both, d):
     biased = replace(both, displacement=d + 0.05)
     parts = stages(biased, "auto")
     assert [names_of(part.measurement()) for part in parts[:2]] == [["deflection"], ["images"]]
-    assert torch.equal(parts[1].measurement().maps[Images.guess], (d + 0.05).float())
+    assert torch.equal(parts[1].measurement().maps[GUESS], (d + 0.05).float())
     assert error(balls, NETWORK(biased)) < 0.15
     assert names_of(of_source(biased, "auto", preferred="displacements")) == ["deflection"]
     assert not replace(NETWORK, source="both", max_steps=60)(biased).outcome.failed

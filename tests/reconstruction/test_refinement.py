@@ -42,7 +42,7 @@ def rig(measurement, *groups, mm=0.5, deg=0.03, px=0.03, **options) -> Refinemen
 
 
 def predict(part, rays):
-    return project(PathIntegral(part.model.integral, 60), BALLS, rays)
+    return project(PathIntegral(part.model, 60), BALLS, rays)
 
 
 def in_sigmas(measurement):

@@ -30,7 +30,8 @@ from nerif.data.volume_file import read_volume
 from nerif.fields.field import Field
 from nerif.fields.voxel_field import VoxelField
 from nerif.forward.forward_model import masked_blur
-from nerif.forward.registry import AUTO, forward_model
+from nerif.forward.images import Images
+from nerif.forward.registry import AUTO
 from nerif.geometry import Box
 from nerif.geometry.body import contained
 from nerif.plotting.notebook import number
@@ -124,10 +125,9 @@ def evaluate_views(reprojection: Reprojection) -> list[ViewScores]:
     from concurrent.futures import ThreadPoolExecutor
 
     measurement, sees_box = reprojection.measurement, reprojection.measurement.sees_box
-    models = {kind: forward_model(kind, measurement) for kind in measurement.techniques if kind.derived}
-    windowed = {kind.derived for kind in models}
-    for model in models.values():
-        model.prepare()
+    images = Images.of(measurement, AUTO) if Images in measurement.techniques else None
+    if images is not None:
+        _ = images.references  # made before threads share them
 
     def scores(view: int, observation: Observation, valid: Bool[Tensor, "view row column"]) -> Any:
         camera, kind = measurement.cameras[view], observation.technique
@@ -137,10 +137,10 @@ def evaluate_views(reprojection: Reprojection) -> list[ViewScores]:
         measured = observation.values[inside].nan_to_num(0.0, 0.0, 0.0)
         row: dict[str, Any] = {"name": camera.name, "withheld": camera.name in reprojection.withheld}
         row |= {"measured": kind.measured, "unit": kind.unit}
-        if kind.derived:
-            still = models[kind].to_map(torch.zeros(height, width, kind.integrals), view)
+        if images is not None and kind is Images:
+            still = images.to_map(torch.zeros(height, width, 2), view)
             measured, predicted = measured - still, predicted - still
-        if kind.name in windowed:
+        elif images is not None and kind.name == Images.derived:
             predicted = _by_windows(predicted, measured, mask)
         row |= view_metrics(measured.numpy(), predicted.numpy(), mask.numpy())
         residual = measured - predicted

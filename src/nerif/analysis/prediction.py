@@ -22,6 +22,7 @@ from nerif.fields.symmetric import SymmetricVoxels, symmetry_of_field
 from nerif.fields.voxel_field import VoxelField
 from nerif.fields.walls import WallNetwork
 from nerif.forward.forward_model import ForwardModel
+from nerif.forward.images import Images
 from nerif.forward.path_integral import LENS_RAYS, FieldProjector, PathIntegral, project
 from nerif.forward.ray_tracing import CurvedRays
 from nerif.forward.registry import ASSUMED, AUTO, TECHNIQUES, check_simulated, forward_model, forward_models
@@ -168,7 +169,8 @@ def reproject(
     for observation in measurement.observations:
         kind = observation.technique
         forward = forward_model(kind, measurement, model)
-        integral = forward.integral
+        images = forward if isinstance(forward, Images) else None
+        integral = forward if images is None else images.integral
         projector = PathIntegral(integral, _samples(field))
         sampled = None if voxels is None else SampledViews(field, (voxels, *splines), box, projector, device)
         predicted = torch.full_like(observation.values, float("nan"))
@@ -180,13 +182,14 @@ def reproject(
                 integrals[integral, i] = sampled(camera).where(crosses, torch.zeros(()))
             elif (integral, i) not in integrals:
                 integrals[integral, i] = predict_view(field, camera, projector, box, device)
-            predicted[i, :height, :width] = forward.to_map(integrals[integral, i], i)
+            of_view = integrals[integral, i]
+            predicted[i, :height, :width] = of_view if images is None else images.to_map(of_view, i)
             done += 1
             on_view(done, total)
         if measurement.hidden is not None:
             predicted[measurement.hidden] = torch.nan  # they see a body
         maps[kind.name] = predicted
-        technique = type(integral) if integral is not forward else kind
+        technique = kind if images is None else type(integral)
         if technique.measured not in accuracies:
             accuracies[technique.measured] = Accuracy(technique)
             if sampled:

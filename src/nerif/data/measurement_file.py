@@ -20,6 +20,7 @@ from nerif.data.kinds import BOST, known_conventions
 from nerif.data.measurement_data import MASKS, MeasurementData, Region
 from nerif.forward.deflection import Deflection
 from nerif.forward.forward_model import ForwardModel
+from nerif.forward.images import Images
 from nerif.forward.registry import TECHNIQUES, technique
 from nerif.geometry import PERSPECTIVE, Box, Camera, Lens, Plane, Projection, projection_named
 from nerif.geometry.body import Body
@@ -190,9 +191,8 @@ def from_dataset(dataset: xr.Dataset) -> dict[str, Any]:
         raise InputError(f"expected a text such as 'x- x+ y- y+', got {faces!r}", field="attribute ambient_faces")
     arguments = ("displacement", "sigma", *MASKS)
     maps = {name: _map(dataset, name) for name in map_names() if name in dataset and name not in arguments}
-    for kind in TECHNIQUES.values():
-        if kind.measured in maps:
-            maps = kind.complete(maps, dataset.attrs)
+    if Images.measured in maps:
+        maps = Images.complete(maps, dataset.attrs)
     index = any(kind.quantity == Deflection.quantity for kind in _techniques(dataset))
     lower, upper = _array(dataset, "box").tolist()
     return {

@@ -112,12 +112,7 @@ class Boussinesq:
         return 0.0
 
     def _pressed(self, velocity: Spectrum, theta: Float[Tensor, "z y x"], rate: Float[Tensor, "z y x"]) -> Spectrum:
-        """Spectrum of -(acceleration by pressure) at an instant.
-
-        Parameters
-        ----------
-        rate : of theta at fixed points, 1/s
-        """
+        """Spectrum of -(acceleration by pressure) at an instant; `rate` of theta at fixed points, 1/s."""
         force = self.box.spectrum(self._force(velocity, theta))
         return force - self.box.solenoidal(force)
 
@@ -129,13 +124,9 @@ class Boussinesq:
         self, pushed: Spectrum, before: Float[Tensor, "z y x"], now: Float[Tensor, "z y x"], seconds: float,
         pressed: Spectrum,
     ) -> tuple[Spectrum, Spectrum]:  # fmt: skip
-        """Velocity after pressure, and -(acceleration by pressure).
+        """Velocity after pressure, and -(acceleration by pressure), before which it was `pressed`.
 
-        Parameters
-        ----------
-        pushed : velocity of the fluid that arrives, with all other forces
-        before, now : theta
-        pressed : an interval before
+        `pushed` is the velocity of the fluid that arrives, with all other forces, `before` and `now` are theta.
         """
         velocity = self.box.solenoidal(pushed)
         return velocity, (pushed - velocity) / (0.5 * seconds)
@@ -154,12 +145,7 @@ class Boussinesq:
     def _from_before(
         self, halfway: Spectrum, fields: Float[Tensor, "c z y x"], seconds: float
     ) -> Float[Tensor, "c z y x"]:
-        """Return fields (coefficients of splines) at the places from which the fluid comes.
-
-        Parameters
-        ----------
-        halfway : velocity halfway in time
-        """
+        """Fields (coefficients of splines) at the places from which the fluid comes, by the velocity halfway in time."""
         box = self.box
         voxels = seconds / torch.tensor(box.spacing[::-1])
         middle = box.nodes - 0.5 * voxels * box.values(halfway).flatten(1).T

@@ -12,15 +12,9 @@ from nerif.fields.voxel_field import spline_weights
 from nerif.geometry import Grid
 
 __all__ = [
-    "along_axes",
-    "averages",
-    "interpolations",
-    "laplacian",
-    "periodic_averages",
-    "periodic_splines",
-    "smooth",
+    "along_axes", "averages", "interpolations", "laplacian", "periodic_averages", "periodic_splines", "smooth",
     "squared_slope",
-]
+]  # fmt: skip
 
 NARROWEST = 1.2  # standard deviation of an average, voxels: finer waves of a density are below the resolution of a film
 

@@ -50,13 +50,10 @@ class LowMach(Boussinesq):
     def _pressed(self, velocity: Spectrum, theta: Float[Tensor, "z y x"], rate: Float[Tensor, "z y x"]) -> Spectrum:
         temperature = self._temperature(theta)
         expansion = self.box.spectrum(self.diffusivity * temperature ** (HEAT + 1) * rate)  # its rate
-        force = self._force(velocity, theta) + self._friction(velocity, temperature)
+        friction = self.viscosity * temperature**HEAT * self.box.values(self.box.filtered(velocity, torch.neg))
+        force = self._force(velocity, theta) + friction  # nu(T) lap u
         wanted = self._potential_part(self.box.spectrum(force)) - 1j * self.box.wave * expansion
         return self._of_variable_density(wanted, temperature, torch.zeros(force.shape), FIRST)
-
-    def _friction(self, velocity: Spectrum, temperature: Tensor) -> Tensor:
-        """nu(T) lap u."""
-        return self.viscosity * temperature**HEAT * self.box.values(self.box.filtered(velocity, torch.neg))
 
     def _gradient(self, pressed: Spectrum, theta: Float[Tensor, "z y x"]) -> Spectrum:
         return self.box.spectrum(self.box.values(pressed) / self._temperature(theta))
@@ -87,13 +84,7 @@ class LowMach(Boussinesq):
     def _of_variable_density(
         self, wanted: Spectrum, temperature: Tensor, gradient: Float[Tensor, "3 z y x"], tolerance: float
     ) -> Spectrum:
-        """T grad p whose potential part is given.
-
-        Parameters
-        ----------
-        gradient : estimate of grad p
-        tolerance : of it, by which its error becomes smaller
-        """
+        """T grad p whose potential part is given, from an estimate of grad p whose error is reduced by `tolerance`."""
         box, lowest, highest = self.box, float(temperature.min()), float(temperature.max())
         mean = 0.5 * (highest + lowest)
         rate = (highest - lowest) / (highest + lowest)  # of an iteration

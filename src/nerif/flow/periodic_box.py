@@ -66,8 +66,7 @@ class PeriodicBox:
         """Spectrum of the B-spline at the nodes."""
         kx, ky, kz = self.wave
         hz, hy, hx = self.spacing
-        response = (2 + torch.cos(kx * hx)) * (2 + torch.cos(ky * hy)) * (2 + torch.cos(kz * hz)) / 27
-        return response
+        return (2 + torch.cos(kx * hx)) * (2 + torch.cos(ky * hy)) * (2 + torch.cos(kz * hz)) / 27
 
     def spectrum(self, values: Float[Tensor, "*c z y x"]) -> Complex[Tensor, "*c z y xr"]:
         """Return the spectrum of real fields."""

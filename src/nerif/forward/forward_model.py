@@ -25,17 +25,8 @@ from nerif.common.conventions import InputError
 from nerif.geometry import Camera, Rays
 
 __all__ = [
-    "ForwardModel",
-    "Light",
-    "Map",
-    "Mask",
-    "PerRay",
-    "SampleVectors",
-    "Samples",
-    "Weights",
-    "masked_blur",
-    "midpoints",
-]
+    "ForwardModel", "Light", "Map", "Mask", "PerRay", "SampleVectors", "Samples", "Weights", "masked_blur", "midpoints",
+]  # fmt: skip
 
 MIN_PATH = 1e-3  # of the longest path through the box; shorter rays are not used to estimate the size of the field
 
@@ -105,7 +96,6 @@ class ForwardModel(ABC):
     sigma: ClassVar[str]  # variable with its standard deviation
     beside: ClassVar[Mapping[str, tuple[int, str]]] = {}  # further maps: components and unit, by variable
     channels: ClassVar[tuple[str, ...]]  # names of the components of the measured quantity
-    integrals: ClassVar[int] = 0  # components of the path integral of a pixel; 0 for one per channel
     unit: ClassVar[str]  # of the measured quantity
     misscaled: ClassVar[str] = "another scale"  # likely cause if all values of one view are too large or too small
     limits: ClassVar[tuple[float, float]]  # smallest plausible sigma; largest plausible value and sigma
@@ -120,12 +110,8 @@ class ForwardModel(ABC):
     additive: ClassVar[bool] = False
     fill: ClassVar[float] = 1.0  # approximate share of the path through the box that contributes: for the field's size
     gains: ClassVar[bool] = False  # intensity gains of cameras can be fitted
-    averaged: ClassVar[bool] = True  # the mean over neighbouring pixels is the measurement of their mean ray
     windowed: ClassVar[bool] = False  # a pixel may be the mean over a correlation window
     derived: ClassVar[str] = ""  # technique whose values are computed from these, such as displacements from images
-    guess: ClassVar[str] = ""  # map with approximate values of the path integral
-    outlier: ClassVar[float] = math.inf  # residual in sigma beyond which the loss is linear (Huber)
-    settles: ClassVar[bool] = False  # parameters of the images have to be fitted beside the field (`settle`)
     linear: ClassVar[bool] = True  # the weights are the whole model, without `bend` and `read`
 
     @classmethod
@@ -154,19 +140,9 @@ class ForwardModel(ABC):
         return self
 
     @property
-    def integral(self) -> ForwardModel:
-        """The model of the path integral alone; itself where that is the measured quantity."""
-        return self
-
-    @property
     def constants(self) -> dict[str, Any]:
         """The properties of the measurement on which the model depends, by name."""
         return dict(vars(self))
-
-    @property
-    def patch(self) -> int:
-        """Edge (px) of the squares of pixels that share one ray, each with its own value."""
-        return 1
 
     @classmethod
     def seen_by(cls, camera: Camera) -> Camera:
@@ -200,41 +176,6 @@ class ForwardModel(ABC):
     def read(self, prediction: PerRay, rays: Rays) -> PerRay:
         """Return the reading of pixels from their path integral."""
         return prediction
-
-    def residual(self, prediction: PerRay, measured: PerRay, rays: Rays) -> PerRay:
-        """Return the predicted minus the measured reading."""
-        return self.read(prediction, rays) - measured
-
-    def settle(self, prediction: PerRay, measured: PerRay, inverse_sigma: PerRay, rays: Rays) -> None:
-        """Fit parameters of the images, such as their brightness, to a predicted path integral."""
-        return
-
-    @property
-    def brightness(self) -> Tensor:
-        """The parameters from `settle`, view by view."""
-        raise NotImplementedError
-
-    def adopt(self, brightness: Tensor) -> None:
-        """Set the parameters to those of another fit."""
-        raise NotImplementedError
-
-    @classmethod
-    def complete(cls, maps: Mapping[str, Tensor], attributes: Mapping[str, Any]) -> dict[str, Tensor]:
-        """Return the maps, with those that are given by attributes of their file."""
-        return dict(maps)
-
-    @classmethod
-    def blur(cls, maps: Mapping[str, Tensor], sizes: Sequence[tuple[int, int]], px: float) -> dict[str, Tensor]:
-        """Return maps of views of (height, width) px, blurred by a Gaussian if that helps to fit them."""
-        return dict(maps)
-
-    def prepare(self) -> None:
-        """Compute what the maps of all views share, before threads compute them in parallel."""
-        return
-
-    def to_map(self, integral: Map, view: int) -> Map:
-        """Return the map of a view from its path integrals."""
-        return integral
 
     def field_scale(self, rays: Rays, measured: PerRay) -> float:
         """Return the typical size of a field with measured values of this size; 0 if all are 0."""

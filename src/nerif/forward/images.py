@@ -32,13 +32,9 @@ from nerif.forward.forward_model import ForwardModel, Light, Map, Mask, PerRay, 
 from nerif.geometry import Rays
 
 __all__ = [
-    "ROUNDING_VARIANCE",
-    "Images",
-    "References",
-    "difference_variance",
-    "grey_variance",
+    "GUESS", "ROUNDING_VARIANCE", "Images", "LinearImages", "References", "difference_variance", "grey_variance",
     "local_mean",
-]
+]  # fmt: skip
 
 DEGREE = 4  # total, of the polynomials of gain and offset
 RIDGE = 1e-4  # of the weight of a pixel, for every term beyond the constants
@@ -204,26 +200,28 @@ def _pixels(height: int, width: int, mask: Tensor | None = None) -> tuple[Tensor
 
 @dataclass(frozen=True, eq=False)
 class Images(LeverArm):
-    """Grey values of the flow image, as those of the displaced reference image."""
+    """Grey values of the flow image, as those of the displaced reference image.
+
+    The path integral is that of `integral`; the data of a reconstruction own the images, which compare it with the
+    grey values of every pixel of a patch (`residual`). Nuisance parameters are gain and offset of every view.
+    """
 
     name = "images"
     measured, sigma = "flow", "image_sigma"
     beside = MappingProxyType({"reference": (1, "grey value"), GUESS: (2, "px")})
     channels = ("",)
-    integrals = 2
     unit = "grey value"
     misscaled = "another exposure"
     limits = (1e-9, 1e9)
-    traced = windowed = linear = averaged = False
-    derived, guess = "deflection", GUESS
-    outlier = 0.75  # the error of splines at a sharp pattern has long tails
-    settles = True
+    traced = windowed = linear = False
+    derived = "deflection"
+    outlier = 0.75  # sigma, beyond which the loss is linear (Huber): splines at a sharp pattern err with long tails
 
     maps: Mapping[str, Tensor] = field(default_factory=dict)
     sizes: Sequence[tuple[int, int]] = ()  # (height, width) of each view, px
 
     @classmethod
-    def of(cls, light: Light, model: str) -> ForwardModel:
+    def of(cls, light: Light, model: str) -> Images:
         reference, flow = light.maps.get("reference"), light.maps.get(cls.measured)
         if reference is None or flow is None:
             raise InputError(
@@ -261,20 +259,19 @@ class Images(LeverArm):
         return {"n_ambient": self.n_ambient, **{name: self.maps.get(name) for name in self.beside}}
 
     @property
-    def integral(self) -> ForwardModel:
+    def integral(self) -> LeverArm:
+        """The model of the displacement."""
         return LeverArm(self.n_ambient)
 
     @property
     def patch(self) -> int:
+        """Edge (px) of the squares of pixels that share one ray, each with its own value."""
         shortest = min(min(size) for size in self.sizes)
         return min(max(1, shortest // MIN_PATCHES), MAX_PATCH)
 
     @property
     def linear_twin(self) -> ForwardModel:
         return LinearImages(self.n_ambient, self.maps, self.sizes)
-
-    def read(self, prediction: PerRay, rays: Rays) -> PerRay:
-        return self.references.flow_at(rays.view, rays.pixel, prediction)[:, None]
 
     def residual(self, prediction: PerRay, measured: PerRay, rays: Rays) -> PerRay:
         """Return the residual of every pixel of a ray's patch; 0 where the reference is not valid."""
@@ -284,17 +281,20 @@ class Images(LeverArm):
         residual = self.references.flow_at(view, pixel, d) - measured.flatten()
         return torch.where(valid | d.isnan().any(dim=-1), residual, 0.0).reshape(measured.shape)
 
-    def settle(self, prediction: PerRay, measured: PerRay, inverse_sigma: PerRay, rays: Rays) -> None:
+    def fit_nuisance(self, prediction: PerRay, measured: PerRay, inverse_sigma: PerRay, rays: Rays) -> None:
+        """Fit gain and offset to predicted displacements."""
         view, pixel = _of_patches(rays, measured.shape[1])
         d = prediction.repeat_interleave(measured.shape[1], dim=0)
         self.references.fit(view, pixel, d, measured.flatten(), inverse_sigma.flatten())
 
     @property
-    def brightness(self) -> Tensor:
+    def nuisance(self) -> Tensor:
+        """The coefficients of gain and offset, view by view."""
         return self.references.brightness
 
-    def adopt(self, brightness: Tensor) -> None:
-        self.references.brightness = brightness.to(self.references.brightness)
+    def set_nuisance(self, nuisance: Tensor) -> None:
+        """Set them to those of another fit."""
+        self.references.brightness = nuisance.to(self.references.brightness)
 
     @classmethod
     def complete(cls, maps: Mapping[str, Tensor], attributes: Mapping[str, Any]) -> dict[str, Tensor]:
@@ -323,6 +323,8 @@ class Images(LeverArm):
 
     @classmethod
     def blur(cls, maps: Mapping[str, Tensor], sizes: Sequence[tuple[int, int]], px: float) -> dict[str, Tensor]:
+        """Return maps of views of (height, width) px, of which the images are blurred by a Gaussian."""
+
         def blurred(image: Float[Tensor, "row column"], squares: bool) -> Tensor:
             good = image.isfinite()
             mean = masked_blur((image.double().square() if squares else image)[..., None], good, px)[..., 0]
@@ -337,10 +339,6 @@ class Images(LeverArm):
                 for i, (height, width) in enumerate(sizes):
                     result[name][i, :height, :width] = blurred(maps[name][i, :height, :width], name == cls.sigma)
         return result
-
-    def prepare(self) -> None:
-        """Build the references: `to_map` fits the brightness of its view in them, and they have no lock."""
-        _ = self.references
 
     def to_map(self, integral: Map, view: int) -> Map:
         """Return the flow image of displacements, with gain and offset fitted to the measured one."""
@@ -379,10 +377,6 @@ class LinearImages(Images):
     """Images linearised about the approximate displacement, or about 0."""
 
     linear = True
-    integrals = 1
-    settles = False
-    outlier = math.inf
-    patch = 1
 
     @property
     def linear_twin(self) -> ForwardModel:
@@ -393,12 +387,6 @@ class LinearImages(Images):
         assert plain.slope is not None
         steep = -self._slope(rays).to(plain.slope)
         return Weights(plain.profile, slope=torch.einsum("ni,nij->nj", steep, plain.slope)[:, None])
-
-    def read(self, prediction: PerRay, rays: Rays) -> PerRay:
-        return prediction
-
-    def residual(self, prediction: PerRay, measured: PerRay, rays: Rays) -> PerRay:
-        return prediction - measured
 
     def reading(self, values: PerRay, sigma: PerRay | None, rays: Rays) -> tuple[PerRay, PerRay | None]:
         """Return flow - g reference(p - d_0) - o - g grad(reference) . d_0; 0 where the reference is not valid."""

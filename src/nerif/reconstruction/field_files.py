@@ -36,22 +36,9 @@ from nerif.reconstruction.reconstructor import OnStep, Reconstruction, State, St
 from nerif.reconstruction.rig_parameters import RefinedView
 
 __all__ = [
-    "CHECKPOINT",
-    "FIELD",
-    "check_fingerprint",
-    "checkpoints",
-    "digest",
-    "digest_of_field",
-    "fingerprint",
-    "read_bodies",
-    "read_field",
-    "read_quantity",
-    "read_rig",
-    "read_state",
-    "read_tensors",
-    "write_field",
-    "write_state",
-    "write_tensors",
+    "CHECKPOINT", "FIELD", "check_fingerprint", "checkpoints", "digest", "digest_of_field", "fingerprint",
+    "read_bodies", "read_field", "read_quantity", "read_rig", "read_state", "read_tensors", "write_field",
+    "write_state", "write_tensors",
 ]  # fmt: skip
 
 CHECKPOINT = "checkpoint.safetensors"

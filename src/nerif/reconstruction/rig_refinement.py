@@ -275,7 +275,7 @@ class Refinement:
             integral = predict(part, self._of(values).apply(part.rays, self.box))
         offset = self._offset(values, part.rays)
         prediction = integral if offset is None else integral + offset
-        return part.model.residual(prediction, part.measured, part.rays) * part.inverse_scale, integral
+        return part.difference(prediction) * part.inverse_scale, integral
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return what a checkpoint stores."""
@@ -389,7 +389,7 @@ def refit(
     target = Target.of(measurement, tuple(settings["open_faces"]), linear=True).to(device)
 
     def predict(part: TechniqueData, rays: Rays) -> Tensor:
-        return project(PathIntegral(part.model.integral, REFIT_SAMPLES), field, rays, device)
+        return project(PathIntegral(part.model, REFIT_SAMPLES), field, rays, device)
 
     for i in range(steps):
         pixels = random_pixels(target, len(measurement.names), i, per_view)

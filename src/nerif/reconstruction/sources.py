@@ -21,6 +21,7 @@ from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
 from nerif.data.measurement_data import Observation
 from nerif.forward.forward_model import masked_blur
+from nerif.forward.images import GUESS, Images
 
 __all__ = ["DataStage", "check_source", "of_source", "resolve_source", "stages"]
 
@@ -79,12 +80,12 @@ def of_source(measurement: Measurement, source: str, blur: float = SOFT_PX, pref
         return images.without(measurement)
     whole = measurement if source == "both" or displacements is None else displacements.without(measurement)
     sizes = [camera.image_size for camera in whole.cameras]
-    maps = images.technique.blur(whole.maps, sizes, blur)
-    variable = images.technique.measured
+    maps = Images.blur(whole.maps, sizes, blur)
+    variable = Images.measured
     maps[variable] = maps[variable].where(whole.usable_for(_pair(whole)[0] or images), math.nan)
     if displacements is not None:
         views = [measurement.names.index(name) for name in whole.names]
-        maps[images.technique.guess] = _extrapolated(measurement, displacements)[views]
+        maps[GUESS] = _extrapolated(measurement, displacements)[views]
     return replace(whole, maps=maps)
 
 

@@ -14,6 +14,7 @@ from nerif.common.transfer import to_device
 from nerif.data.measurement import Measurement
 from nerif.data.measurement_data import Observation
 from nerif.forward.forward_model import ForwardModel
+from nerif.forward.images import Images
 from nerif.forward.registry import AUTO, forward_models
 from nerif.geometry import Rays
 from nerif.reconstruction.bins import binned_rays, patches
@@ -33,6 +34,7 @@ class TechniqueData:
     inverse_scale: Float[Tensor, "n c"]  # 1/sigma, scaled to an ambient residual of mean square 1 over all parts
     outlier: float = math.inf  # scaled residual beyond which the loss is linear (Huber)
     offset: Float[Tensor, "n k"] | None = None  # added to predictions
+    images: Images | None = None  # with which the integral is compared, if `measured` are grey values
 
     def __len__(self) -> int:
         return len(self.rays)
@@ -52,13 +54,19 @@ class TechniqueData:
         Outliers are reduced by a factor without gradient, so that the slope of their square is that of Huber's loss.
         """
         integral = prediction if self.offset is None else prediction + self.offset
-        r = self.model.residual(integral, self.measured, self.rays) * self.inverse_scale
+        r = self.difference(integral) * self.inverse_scale
         return r if math.isinf(self.outlier) else r * (self.outlier / r.detach().abs().clamp(min=self.outlier)).sqrt()
+
+    def difference(self, integral: Float[Tensor, "n k"]) -> Float[Tensor, "n c"]:
+        """Return the reading of a path integral minus the measured one."""
+        if self.images is not None:
+            return self.images.residual(integral, self.measured, self.rays)
+        return self.model.read(integral, self.rays) - self.measured
 
     @property
     def ambient_residual(self) -> Float[Tensor, "n c"]:
         """The scaled residual of the ambient field."""
-        return self.residual(self.measured.new_zeros(len(self), self.model.integrals or self.measured.shape[1]))
+        return self.residual(self.measured.new_zeros(len(self), len(self.model.channels)))
 
     @property
     def of_field(self) -> Float[Tensor, "n c"]:
@@ -105,19 +113,21 @@ class Target:
         parts, scales = [], []
         sigma_known = all(o.sigma is not None for o in measurement.observations)
         for forward, observation in zip(models, measurement.observations, strict=True):
-            patch = 1 if single else forward.patch
+            images = forward if isinstance(forward, Images) and not forward.linear else None
+            patch = 1 if single or images is None else images.patch
             rays, values, sigma = _rays(measurement, observation, open_faces, edge, patch)
             scales.append(forward.field_scale(rays, values))
             measured, noise = forward.reading(values, sigma if observation.sigma is not None else None, rays)
             noise = sigma if observation.sigma is None else noise  # of bins: by their number of pixels
             inverse = torch.ones_like(measured) if noise is None else 1 / noise
-            parts.append(TechniqueData(forward, rays, measured, inverse))
+            of_rays = forward if images is None else images.integral
+            parts.append(TechniqueData(of_rays, rays, measured, inverse, images=images))
         empty = torch.cat([p.ambient_residual.flatten() for part in parts for p in part.split()])
         chi_square = float(empty.square().mean()) or 1.0  # for data that are all 0
         unit = 1 / math.sqrt(chi_square)
         parts = [replace(p, inverse_scale=p.inverse_scale * unit) for p in parts]
         if sigma_known:
-            parts = [replace(p, outlier=p.model.outlier * unit) for p in parts]
+            parts = [replace(p, outlier=_outlier(p) * unit) for p in parts]
         scale = math.sqrt(sum(s**2 for s in scales) / len(scales)) or 1e-6
         noise_share = _noise_share(parts, chi_square) if sigma_known else None
         return cls(tuple(parts), scale, chi_square, sigma_known, noise_share)
@@ -153,7 +163,7 @@ def _rays(
     """The rays that cross none of the open faces, the values of them or their patches, and sigma."""
     if patch > 1:
         return patches(measurement, observation, patch, open_faces)
-    binned = edge > 1 and observation.technique.averaged
+    binned = edge > 1 and not observation.technique.derived
     bins = binned_rays(measurement, observation, edge, open_faces) if binned else None
     rays, values, sigma = bins or measurement.rays(observation)
     keep = ~rays.exit_faces(measurement.box, open_faces)
@@ -164,6 +174,11 @@ def _rays(
     return rays[keep], values[keep], None if sigma is None else sigma[keep]
 
 
+def _outlier(part: TechniqueData) -> float:
+    """Residual in sigma beyond which the loss is linear."""
+    return math.inf if part.images is None else part.images.outlier
+
+
 def _noise_share(parts: list[TechniqueData], chi_square: float) -> float:
     """Mean square residual of the noise over that of the ambient field, both by Huber's loss.
 
@@ -172,6 +187,6 @@ def _noise_share(parts: list[TechniqueData], chi_square: float) -> float:
     if all(math.isinf(part.outlier) for part in parts):
         return 1 / chi_square
     numbers = sum(part.measured.numel() for part in parts)
-    noise = sum(math.erf(part.model.outlier / math.sqrt(2)) * part.measured.numel() for part in parts)
+    noise = sum(math.erf(_outlier(part) / math.sqrt(2)) * part.measured.numel() for part in parts)
     empty = sum(float(p.ambient_residual.square().sum()) for part in parts for p in part.split())
     return noise / chi_square / (empty or numbers)

@@ -200,7 +200,7 @@ class Live:
         index = m.names.index(self.view)
         for observation in m.observations:
             forward = forward_model(observation.technique, m, self.model)
-            if forward.integral is forward and bool(m.usable_for(observation)[index].any()):
+            if not observation.technique.derived and bool(m.usable_for(observation)[index].any()):
                 return observation, forward
         return None
 

@@ -42,7 +42,7 @@ def refine_rig(data: TrainingData, field: NeuralField, density: SamplingDensity,
             if batch.lens is not None:
                 batch, each, count = batch.spread(LENS_RAYS, generator), LENS_RAYS, SAMPLES // 2
             s, step = sample_rays(batch, count, generator, "adaptive", density, each)
-            integral = PathIntegral(part.model.integral).along(field, batch, s, step)
+            integral = PathIntegral(part.model).along(field, batch, s, step)
             integrals.append(integral if each == 1 else batch.mean_of(each, integral))
         return torch.cat(integrals)
 

@@ -68,11 +68,6 @@ class Cycles(Resumable):
         """Steps of all cycles."""
         return self.first * (2**MAX_CYCLES - 1)
 
-    @property
-    def possible_end(self) -> int:
-        """The next step at which the run may have converged."""
-        return max(self.least_steps, self.step + self.length)
-
     def progress(self, step: int) -> float:
         """Return the share of the present cycle: 0 at its start, 1 at its end."""
         return (step - self.step) / self.length
@@ -185,14 +180,12 @@ class Schedule:
         return shares + ([self.seconds / settings.time_limit] if settings.time_limit else [])
 
     @property
-    def share(self) -> float:
-        """Smallest possible share of the run: 0 at the start, 1 at the latest end."""
-        return self.progress if self.cycles is None else self.step / self.cycles.most_steps
-
-    @property
     def to_possible_end(self) -> float:
         """Share of the run for a progress bar: 1 at its limit or, without one, at the next step at which it may end."""
-        return self.progress if self.cycles is None else self.step / self.cycles.possible_end
+        cycles = self.cycles
+        if cycles is None:
+            return self.progress
+        return self.step / max(cycles.least_steps, cycles.step + cycles.length)
 
     def count(self, rays: int) -> None:
         """Count the rays of a step."""
@@ -212,7 +205,8 @@ class Schedule:
     @property
     def remaining(self) -> float:
         """Rays for which there is still time; inf without a limit of steps or time."""
-        share = max(self._shares() if self.cycles is None else [*self._shares(), self.share], default=0.0)
+        latest = [] if self.cycles is None else [self.step / self.cycles.most_steps]
+        share = max(self._shares() + latest, default=0.0)
         return self.ray_count * (1 - share) / share if share else math.inf
 
     def smaller_bins(self, edge: int) -> int:

@@ -149,21 +149,11 @@ class Trainer:
         if errors is not None and self.data.gauge_free and self.field.network.limits == UNBOUNDED:
             self.field.offset = float(errors.mean())
         return Reconstruction(
-            field=self.field,
-            box=self.data.box,
-            n_ambient=self.data.n_ambient,
-            history=self.watch.records,
-            outcome=outcome,
-            settings=asdict(self.settings),
-            seconds=self.schedule.seconds,
-            peak_memory_bytes=peak_memory(self.device),
-            device=str(self.device),
-            state=state,
-            quantity=self.data.quantity,
-            rig=self.data.rig(),
-            axis=self.data.axis,
-            bodies=self.data.measurement.bodies,
-        )
+            field=self.field, box=self.data.box, n_ambient=self.data.n_ambient, history=self.watch.records,
+            outcome=outcome, settings=asdict(self.settings), seconds=self.schedule.seconds,
+            peak_memory_bytes=peak_memory(self.device), device=str(self.device), state=state,
+            quantity=self.data.quantity, rig=self.data.rig(), axis=self.data.axis, bodies=self.data.measurement.bodies,
+        )  # fmt: skip
 
     # -- checkpoints -------------------------------------------------------------------------------------------------
 

@@ -22,7 +22,7 @@ from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
 from nerif.fields.network import NeuralField
 from nerif.fields.network_kinds import network_in
-from nerif.forward.forward_model import ForwardModel
+from nerif.forward.images import Images
 from nerif.forward.path_integral import PathIntegral, project
 from nerif.reconstruction.aperture import apply_aperture, lens_rays
 from nerif.reconstruction.bins import coarsest_edge, withhold_pixels
@@ -198,22 +198,22 @@ class TrainingData:
         """Fit nuisance parameters to a field, at random pixels."""
         generator = torch.Generator().manual_seed(self.stage)
         for part in self.target.parts:
-            if part.model.settles:
+            if part.images is not None:
                 index = torch.randperm(len(part), generator=generator)[: NUISANCE_PIXELS * len(self.names)]
                 pixels = self.with_rig(part[index.to(self.device)])
                 rays = replace(pixels.rays, lens=None)
-                integral = project(PathIntegral(pixels.model.integral, NUISANCE_SAMPLES), field, rays, self.device)
-                pixels.model.settle(integral, pixels.measured, pixels.inverse_scale, rays)
+                integral = project(PathIntegral(pixels.model, NUISANCE_SAMPLES), field, rays, self.device)
+                part.images.fit_nuisance(integral, pixels.measured, pixels.inverse_scale, rays)
 
     def copy_nuisance(self) -> None:
         """Give withheld pixels the nuisance parameters of the others."""
         if self.withheld is not None:
-            for model, other in zip(_nuisance_models(self.target), _nuisance_models(self.withheld), strict=False):
-                other.adopt(model.brightness[[self.names.index(name) for name in self.withheld_names]])
+            for images, other in zip(_images(self.target), _images(self.withheld), strict=False):
+                other.set_nuisance(images.nuisance[[self.names.index(name) for name in self.withheld_names]])
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return nuisance parameters and rig for a checkpoint."""
-        nuisance = {str(i): model.brightness.clone() for i, model in enumerate(_nuisance_models(self.target))}
+        nuisance = {str(i): images.nuisance.clone() for i, images in enumerate(_images(self.target))}
         return nuisance | rig_state(self.refinement)
 
     def load_state_dict(self, stage: int, state: dict[str, Tensor], edge: int | None = None) -> None:
@@ -222,10 +222,10 @@ class TrainingData:
         if (stage, edge) != (self.stage, self.edge):
             self.stage = stage
             self.set_bins(edge)
-        for i, model in enumerate(_nuisance_models(self.target)):
-            model.adopt(state[str(i)])
+        for i, images in enumerate(_images(self.target)):
+            images.set_nuisance(state[str(i)])
         load_rig(self.refinement, state)
 
 
-def _nuisance_models(target: Target) -> list[ForwardModel]:
-    return [part.model for part in target.parts if part.model.settles]
+def _images(target: Target) -> list[Images]:
+    return [part.images for part in target.parts if part.images is not None]

@@ -168,7 +168,7 @@ def residuals(
     count = torch.zeros_like(total)
     for part in random_pixels(Target.of(measurement, open_faces, linear=True), len(rig.cameras), 0):
         corrected = rig.of(part)
-        residual = corrected.residual(project(PathIntegral(part.model.integral, SAMPLES), field, corrected.rays))
+        residual = corrected.residual(project(PathIntegral(part.model, SAMPLES), field, corrected.rays))
         view = part.rays.view.long()
         total.index_add_(0, view, residual.double().square().sum(-1))
         count.index_add_(0, view, torch.full_like(view, residual.shape[1], dtype=torch.float64))

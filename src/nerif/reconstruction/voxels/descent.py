@@ -370,18 +370,8 @@ class VoxelRun:
         state.scalars["outcome"] = [outcome.reason, outcome.message]
         state.scalars["tolerance"] = self.settings.tolerance
         return Reconstruction(
-            field=self._field(self.here).to("cpu"),
-            box=self.measurement.box,
-            n_ambient=self.measurement.n_ambient,
-            history=self.history,
-            outcome=outcome,
-            settings=asdict(self.settings),
-            seconds=self.seconds,
-            peak_memory_bytes=peak_memory(self.device),
-            device=str(self.device),
-            state=state,
-            quantity=self.measurement.quantity,
-            rig=self._table(),
-            axis=self.axis,
-            bodies=self.measurement.bodies,
-        )
+            field=self._field(self.here).to("cpu"), box=self.measurement.box, n_ambient=self.measurement.n_ambient,
+            history=self.history, outcome=outcome, settings=asdict(self.settings), seconds=self.seconds,
+            peak_memory_bytes=peak_memory(self.device), device=str(self.device), state=state,
+            quantity=self.measurement.quantity, rig=self._table(), axis=self.axis, bodies=self.measurement.bodies,
+        )  # fmt: skip

@@ -155,7 +155,7 @@ def _ray_counts(measurement: Measurement, grid: Grid) -> list[tuple[int, int]]:
     """Return the numbers of rays, of bins where pixels are averaged, and of channels of each technique."""
     pixels, counts = bins_of(measurement, grid, FINE_BIN) ** 2, []
     for o in measurement.observations:
-        rays = int(measurement.usable_for(o).sum()) // (pixels if o.technique.averaged else 1)
+        rays = int(measurement.usable_for(o).sum()) // (1 if o.technique.derived else pixels)
         counts.append((rays + 1, len(o.technique.channels)))
     return counts
 
