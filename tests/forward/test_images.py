@@ -33,7 +33,6 @@ from nerif.reconstruction.neural.training_data import TrainingData
 from nerif.reconstruction.projector import Projector
 from nerif.reconstruction.sources import of_source, stages
 from nerif.reconstruction.target import Target
-from nerif.reconstruction.voxels.operator import VoxelOperator
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from refusals import refused
 
@@ -180,21 +179,6 @@ def test_the_linear_model_is_the_slope_of_the_displaced_one(taken):
     measured, _ = twin.reading(values, None, rays)
     at_guess = -(twin._slope(rays) * 0.3).sum(dim=-1, keepdim=True) - measured  # type: ignore[attr-defined]
     assert torch.allclose(at_guess, model.residual(guess, values, rays), atol=0.5)
-
-
-@pytest.mark.parametrize("cone", [None, 8.0])
-def test_the_adjoint_of_linear_images_is_exact(taken, cone):
-    if cone:
-        cameras = replace(RING).cameras(f_number=cone)
-        taken = replace(taken, cameras=cameras)
-    (part,) = Target.of(of_source(taken, "images"), linear=True).parts
-    grid = Grid.of_resolution(BOX, 12)
-    operator = VoxelOperator(part.rays, grid, part.model, "cubic", dtype=torch.float64)
-    draw = torch.Generator().manual_seed(1)
-    x = torch.randn(grid.shape, generator=draw, dtype=torch.float64)
-    y = torch.randn(operator.range_shape, generator=draw, dtype=torch.float64)
-    assert operator.range_shape[1] == 1
-    assert float((operator(x) * y).sum()) == pytest.approx(float((x * operator.T(y)).sum()), rel=1e-10)
 
 
 def test_outliers_have_the_slope_of_the_huber_loss(taken):

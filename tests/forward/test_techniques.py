@@ -19,17 +19,16 @@ from nerif.data.measurement import Measurement, measurement_of
 from nerif.fields.field import Field
 from nerif.fields.network import Network, NetworkShape, NeuralField
 from nerif.fields.phantoms import GaussianBalls, Scaled
-from nerif.fields.voxel_field import Boundary
 from nerif.forward import registry
 from nerif.forward.absorption import Absorption, absorbance
 from nerif.forward.deflection import Deflection
 from nerif.forward.emission import Emission
-from nerif.forward.forward_model import ForwardModel, Light, Weights, midpoints
+from nerif.forward.forward_model import ForwardModel, Weights, midpoints
 from nerif.forward.images import Images
 from nerif.forward.interferometry import Interferometry
 from nerif.forward.path_integral import PathIntegral
 from nerif.forward.registry import TECHNIQUES, forward_model, forward_models
-from nerif.geometry import Box, Grid, Lens, Rays, Ring
+from nerif.geometry import Grid, Lens, Rays
 from nerif.reconstruction.field_files import read_state, write_state
 from nerif.reconstruction.neural.losses import LossWeights, loss_terms
 from nerif.reconstruction.neural.neural import NeRIF
@@ -44,10 +43,9 @@ from nerif.reconstruction.voxels.total_variation import TotalVariation
 from nerif.reconstruction.voxels.voxel_problem import Problem
 from nerif.simulation.simulate import Simulation, simulate
 from refusals import refused
+from techniques import BOX, RING, Cubic, Knife
 
 PACKAGE = Path(registry.__file__).parents[1]
-BOX = Box((-10.0, -8.0, -6.0), (9.0, 11.0, 7.0))
-RING = Ring(views=5, image_size=(18, 23), pixel_pitch=0.13, distance=400.0, background_distance=300.0)
 SIMULATED = {name: kind for name, kind in TECHNIQUES.items() if not kind.derived}
 OTHERS = [Absorption, Emission, Interferometry]
 NETWORK = NeRIF(network=NetworkShape(width=48, depth=3), points_per_batch=2048, max_steps=120, device="cpu")
@@ -83,29 +81,6 @@ def test_a_technique_is_one_file_and_nothing_else_depends_on_it():
             assert not others & {node.module for node in nodes if isinstance(node, ast.ImportFrom)}, path
 
 
-@dataclass(frozen=True)
-class Knife(ForwardModel):
-    """A toy: deflections across and along an edge, weaker the deeper, and a little of the field itself."""
-
-    name, measured, sigma = "knife", "grey", "grey_sigma"
-    channels = ("across", "along", "open")
-    unit = "1"
-    limits = (1e-9, 1e9)
-    quantity = "index_excess"
-
-    @classmethod
-    def of(cls, light: Light, model: str) -> ForwardModel:
-        return cls()
-
-    def weights(self, rays: Rays, s: Float[Tensor, "n m"], step: Float[Tensor, "n m"]) -> Weights:
-        up = rays.direction.new_tensor([[0.0, 0.0, 1.0]]).expand_as(rays.direction)
-        side = torch.linalg.cross(rays.direction, up)
-        depth = (s - rays.near[:, None]) / 40
-        value = rays.near.new_tensor([300.0, 100.0, 200.0]).expand(len(rays), 3)
-        slope = 3e3 * torch.stack([side, torch.linalg.cross(side, rays.direction), 0 * side], dim=1)
-        return Weights(torch.exp(-depth) * step, value=value, slope=slope)
-
-
 @pytest.mark.slow
 def test_a_technique_of_your_own_runs_through_everything(balls, monkeypatch, tmp_path):
     monkeypatch.setitem(registry.TECHNIQUES, "knife", Knife)
@@ -131,46 +106,8 @@ def test_a_technique_of_your_own_runs_through_everything(balls, monkeypatch, tmp
 # -- projections -----------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Cubic(Knife):
-    """A toy whose profile is antisymmetric about the middle of the ray, but not linear."""
-
-    name, channels = "cubic", ("",)
-
-    def weights(self, rays: Rays, s: Float[Tensor, "n m"], step: Float[Tensor, "n m"]) -> Weights:
-        middle = 0.5 * (rays.near + rays.far)[:, None]
-        return Weights(((s - middle) / 10) ** 3 * step, value=step.new_ones(len(rays), 1))
-
-
 def rays_of(m: Measurement) -> Rays:
     return m.rays()[0].to(dtype=torch.float64)
-
-
-@pytest.mark.parametrize(
-    ("kind", "basis"),
-    [
-        *((kind, "cubic") for kind in SIMULATED.values()),
-        *(pytest.param(kind, "linear", marks=pytest.mark.slow) for kind in SIMULATED.values()),
-        (Knife, "cubic"),
-        (Cubic, "cubic"),
-    ],
-    ids=lambda x: x if isinstance(x, str) else x.name,
-)
-def test_the_voxel_operator_and_its_adjoint(kind, basis, measured, balls):
-    m = measured["deflection"]
-    model, rays, grid = forward_model(kind, m), rays_of(m)[::3], Grid(BOX, (11, 9, 13))
-    a = VoxelOperator(rays, grid, model, basis, Boundary(("x-", "z+")), dtype=torch.float64)
-    g = torch.Generator().manual_seed(0)
-    c, y = (torch.randn(shape, generator=g, dtype=torch.float64) for shape in (a.domain_shape, a.range_shape))
-    compiled, adjoint = a(c), a.T(y)
-    assert abs(float((compiled * y).sum() - (c * adjoint).sum())) <= 1e-12 * float(compiled.norm() * y.norm())
-    a.compiled = False  # plain kernels
-    assert torch.allclose(a(c), compiled, rtol=1e-12, atol=1e-12 * float(compiled.abs().max()))
-    assert torch.allclose(a.T(y), adjoint, rtol=1e-12, atol=1e-12 * float(adjoint.abs().max()))
-    # the path integral through the spline
-    fine = VoxelOperator(rays, grid, model, basis, Boundary(), step=0.05, dtype=torch.float64)
-    exact = PathIntegral(model, 600)(fine.field(c), rays)
-    assert float((fine(c) - exact).norm() / exact.norm()) < 2e-2
 
 
 def test_weights_of_a_wrong_number_of_channels_are_refused(measured, monkeypatch):

@@ -18,7 +18,7 @@ from nerif.data.volume_file import read_volume
 from nerif.fields.network import NetworkShape
 from nerif.fields.phantoms import make_phantom
 from nerif.forward.images import Images
-from nerif.forward.path_integral import PathIntegral, project
+from nerif.forward.path_integral import PathIntegral
 from nerif.forward.registry import forward_model
 from nerif.geometry import Box, Grid, Lens, Ring
 from nerif.reconstruction.aperture import apply_aperture, lens_rays
@@ -115,32 +115,13 @@ def test_a_lens_focused_on_the_flow_is_like_a_pinhole_there(wide):
     assert float((flow - pinhole).std()) < 0.5 * float((background - pinhole).std())
 
 
-@pytest.mark.parametrize("window", [0.0, 4.0])
-@pytest.mark.parametrize("basis", ["linear", "cubic"])
-@pytest.mark.parametrize("compiled", [True, False])
-def test_the_adjoint_of_an_operator_through_lenses(basis, compiled, window, wide):
-    cameras = tuple(replace(c, lens=replace(c.lens, window=window)) for c in wide.cameras)
-    rays, values, _ = replace(wide, cameras=cameras).rays()
-    grid = Grid.of_resolution(BOX, 12)
-    operator = VoxelOperator(rays, grid, forward_model(wide.techniques[0], wide), basis, dtype=torch.float64)
-    operator.compiled = compiled
-    generator = torch.Generator().manual_seed(0)
-    x = torch.rand(grid.shape, generator=generator, dtype=torch.float64)
-    y = torch.rand(values.shape, generator=generator, dtype=torch.float64)
-    assert operator.range_shape == tuple(values.shape)
-    assert float((operator(x) * y).sum()) == pytest.approx(float((x * operator.T(y)).sum()), rel=1e-9)
-
-
-def test_the_operator_agrees_with_the_path_integral(wide):
+def test_a_wider_cone_and_smaller_voxels_have_more_rays_in_an_operator(wide):
     rays, _, _ = wide.rays()
-    grid, model = Grid.of_resolution(BOX, 40), forward_model(wide.techniques[0], wide)
-    operator, c = VoxelOperator(rays, grid, model, "cubic"), flame().sample(grid)
-    exact = project(PathIntegral(model, 120), operator.field(c), rays)
-    assert float((operator(c) - exact).std()) < 0.04 * float(exact.std())
     assert rays_through(rays, 1.0) > rays_through(rays, 10.0) >= 2
     assert rays_through(rays, 1e-3) == 16
     assert rays_through(replace(rays, lens=None), 1.0) == 1
-    assert operator.for_rays(rays[:10], model).range_shape == (10, 2)
+    operator = VoxelOperator(rays, Grid.of_resolution(BOX, 8), forward_model(wide.techniques[0], wide), "cubic")
+    assert operator.for_rays(rays[:10], forward_model(wide.techniques[0], wide)).range_shape == (10, 2)
 
 
 def test_the_aperture_can_be_off_or_required(wide):

@@ -14,17 +14,11 @@ from nerif.common.arrays import Points
 from nerif.fields.field import Field
 from nerif.fields.phantoms import make_phantom
 from nerif.forward.emission import Emission
-from nerif.forward.forward_model import midpoints
-from nerif.forward.path_integral import PathIntegral
-from nerif.forward.registry import forward_models
-from nerif.geometry import Box, Grid, Lens, Ring, paper_rig
+from nerif.geometry import Box, Grid, Ring, paper_rig
 from nerif.geometry.symmetry import Symmetry
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.voxels.landweber import Landweber
-from nerif.reconstruction.voxels.layout import Symmetric
 from nerif.reconstruction.voxels.multiplicative import MLEM
-from nerif.reconstruction.voxels.operator import rays_through
-from nerif.reconstruction.voxels.symmetric_operator import SymmetricOperator
 from nerif.reconstruction.voxels.symmetry_axis import (
     axis_of,
     better_direction,
@@ -55,31 +49,6 @@ def error(result, box, truth=None):
     grid = Grid.of_resolution(box, 32)
     values = (truth or make_phantom("gaussian-jet", box, 0)).sample(grid)
     return float((result.field.sample(grid) - values).norm() / values.norm())
-
-
-@pytest.mark.parametrize("text", ["axis", "planar", "axis+2"])
-@pytest.mark.parametrize("basis", ["cubic", pytest.param("linear", marks=pytest.mark.slow)])
-def test_the_operator_is_the_path_integral_of_its_field_and_has_its_adjoint(jet, text, basis):
-    direction = (0.1, 1.0, 0.03) if text == "planar" else (0.1, 0.05, 1.0)
-    symmetry = Symmetry.about(text, (1.0, 2.0, 0.0), direction, 0.2)
-    layout = Symmetric(box=jet.box, faces=SIDES, basis=basis, symmetry=symmetry, dtype=torch.float64)
-    grid = layout.grid(24)
-    rays = jet.rays()[0][::13].to(dtype=torch.float64)
-    (model,) = forward_models(jet.techniques, jet, "auto", True)
-    operator = layout.operator(rays, grid, model)
-    random = torch.Generator().manual_seed(0)
-    c = torch.randn(grid.shape, dtype=torch.float64, generator=random)
-    y = operator(c)
-    z = torch.randn(y.shape, dtype=torch.float64, generator=random)
-    assert float((y * z).sum()) == pytest.approx(float((c * operator.T(z)).sum()), rel=1e-11)
-    torch.testing.assert_close((operator.matrix() @ c.flatten()), y, rtol=0, atol=1e-11 * float(y.abs().max()))
-    field, index = layout.field(c, grid), operator.curves.index
-    for i in range(0, len(index), 41):
-        ray, n = rays[index[i : i + 1]], int(operator.curves.path[3][i])
-        step = (ray.far - ray.near) / n
-        s = ray.near + (torch.arange(n) + 0.5) * step
-        expected = PathIntegral(model).along(field, ray, s[None], step.expand(1, n))
-        assert float((expected[0] - y[index[i]]).abs().max()) < 1e-6 * float(y.abs().max())
 
 
 @pytest.mark.parametrize(
@@ -251,22 +220,3 @@ def test_a_resumed_run_equals_a_complete_one(jet):
     again = settings(one_view(jet), resume=half.state)
     points = 20 * torch.rand(50, 3) - 10
     assert torch.equal(again.field(points), settings(one_view(jet)).field(points))
-
-
-def test_pixels_through_a_lens(jet):
-    """The operator and the path integral have the same mean over the lens."""
-    wide = replace(jet.cameras[0], lens=Lens(10.0))
-    rays = wide.rays(wide.pixel_grid().reshape(-1, 2)).clip(jet.box).to(dtype=torch.float64)[:400:7]
-    symmetry = Symmetry.about("axis", (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), 0.1)
-    layout = Symmetric(box=jet.box, faces=SIDES, basis="cubic", symmetry=symmetry)
-    grid = layout.grid(24)
-    (model,) = forward_models(jet.techniques, jet, "auto", True)
-    operator = SymmetricOperator(symmetry, rays, grid, model, "cubic", layout.boundary, dtype=torch.float64)
-    c = layout.sample(make_phantom("gaussian-jet", jet.box, 0), grid).double()
-    each = rays_through(rays, min(grid.spacing))
-    spread = rays.spread(each)
-    s, step = midpoints(spread, 300)
-    through = spread.mean_of(each, PathIntegral(model).along(layout.field(c, grid), spread, s, step))
-    mean, crosses = operator(c), rays.crosses
-    assert each > 2
-    assert float((mean - through)[crosses].norm() / through[crosses].norm()) < 0.005
