@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
 import xarray as xr
 
 from nerif.analysis.consistency import check_consistency
-from nerif.analysis.evaluation import evaluate_views, evaluate_volume
+from nerif.analysis.evaluation import evaluate_views
 from nerif.analysis.prediction import predict_view, reproject
 from nerif.cli.cli import main
 from nerif.data.measurement import Measurement
-from nerif.data.volume_file import read_volume
 from nerif.fields.network import NetworkShape
 from nerif.fields.phantoms import make_phantom
 from nerif.forward.images import Images
@@ -30,14 +28,12 @@ from nerif.reconstruction.neural.sampling import PixelSampling, Sampler
 from nerif.reconstruction.neural.training_data import TrainingData
 from nerif.reconstruction.voxels.operator import VoxelOperator, rays_through
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
-from nerif.reconstruction.voxels.total_variation import TotalVariation
 from nerif.results.directory import ResultDirectory
 from nerif.simulation.simulate import simulate, view_displacement
 from refusals import refused
 
 BOX = Box.cube(50.0)
 RING = Ring(views=4, arc=(0.0, 135.0), image_size=(14, 16), pixel_pitch=0.25)
-RIGS = Path(__file__).parents[3] / "shared" / "data" / "rigs"
 
 
 def flame():
@@ -198,17 +194,6 @@ def test_the_lens_reduces_the_error(wide):
 
 
 @pytest.mark.slow
-def test_a_run_through_lenses_resumes_exactly(wide):
-    settings = NeRIF(max_steps=20, points_per_batch=1024, device="cpu", lens_rays=6)
-    points = torch.rand(30, 3, generator=torch.Generator().manual_seed(0)) * 40 - 20
-    whole = settings(wide)
-    half = settings(wide, on_step=lambda step: step.step == 10)
-    assert torch.equal(whole.field(points), settings(wide, resume=half.state).field(points))
-    with refused("resume"):
-        settings(apply_aperture(wide, "off"), resume=half.state)
-
-
-@pytest.mark.slow
 def test_lenses_on_the_command_line(wide, tmp_path, capsys):
     path, out = tmp_path / "m.nc", tmp_path / "r"
     wide.write(path)
@@ -236,18 +221,6 @@ def test_lenses_on_the_command_line(wide, tmp_path, capsys):
     assert "expected a measurement with aperture_diameter" in told
     assert len(told.splitlines()) == 1
     assert not (tmp_path / "t").exists()
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not RIGS.is_dir(), reason="shared/data is missing")
-@pytest.mark.parametrize("method", [NeRIF(time_limit=45.0, epochs=1e9), TotalVariation(voxels=48)], ids=["nerif", "tv"])
-def test_the_cone_of_a_rig_of_others_reduces_the_error(method):
-    measurement, truth = Measurement.read(RIGS / "f4.nc"), read_volume(RIGS / "truth.nc")
-    errors = [
-        evaluate_volume(replace(method, aperture=aperture)(measurement).field, truth, measurement.n_ambient)["l2"]
-        for aperture in ("auto", "off")
-    ]
-    assert errors[0] < 0.8 * errors[1]
 
 
 @pytest.mark.slow

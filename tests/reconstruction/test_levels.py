@@ -103,15 +103,6 @@ def test_the_residual_is_that_of_pixels_also_where_the_last_bins_are_larger():
 
 
 @pytest.mark.slow
-def test_a_run_stopped_on_a_grid_with_bins_resumes_there(flame):
-    method = Tikhonov(voxels=24, device="cpu", iterations=12)
-    first = method(flame, on_step=lambda step: step.step == 3)
-    assert first.outcome.reason == "interrupted"
-    assert first.history[-1]["bin_edge"] > 1
-    assert difference(method(flame, resume=first.state), method(flame), 24) < 1e-2
-
-
-@pytest.mark.slow
 def test_a_search_for_the_weight_is_the_same_after_a_pause(flame):
     """Also if the run began from a field, which the resumed run does not have."""
     method = Tikhonov(voxels=24, device="cpu", iterations=3)

@@ -371,14 +371,6 @@ def test_without_a_compiler_the_network_is_not_compiled(measurement, monkeypatch
     assert failed.history[-1]["loss"] == plain.history[-1]["loss"]
 
 
-@pytest.mark.cuda
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="no NVIDIA GPU here")
-def test_trains_on_a_gpu(measurement):
-    result = replace(SMALL, device="cuda", precision="auto", max_steps=100)(measurement)
-    assert result.history[-1]["loss"] < result.history[0]["loss"]
-    assert result.peak_memory_bytes > 0
-
-
 def test_presets(measurement: Measurement):
     paper = preset("paper")
     assert (paper.network.depth, paper.network.width, paper.network.skip, paper.network.head_width) == (7, 256, 4, 64)

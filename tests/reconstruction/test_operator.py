@@ -169,16 +169,6 @@ def test_rays_that_miss_the_box_project_to_zero(rays, box, basis):
     assert torch.allclose(a(c)[:30], operator(rays[:30], box, basis=basis)(c))
 
 
-@pytest.mark.cuda
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="no NVIDIA GPU here")
-@BASES
-def test_cuda_equals_the_cpu(rays, box, basis):
-    cpu, cuda = (operator(rays, box, basis=basis, device=d) for d in ("cpu", "cuda"))
-    c, d = random(*cpu.domain_shape), random(*cpu.range_shape, seed=1)
-    assert torch.allclose(cuda(c).cpu(), cpu(c), rtol=1e-10, atol=1e-10 * float(cpu(c).abs().max()))
-    assert torch.allclose(cuda.T(d).cpu(), cpu.T(d), rtol=1e-10, atol=1e-10 * float(cpu.T(d).abs().max()))
-
-
 def test_a_small_box_far_from_its_camera_is_within_the_precision_of_its_rays():
     box = Box((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
     camera = Ring(views=1, image_size=(9, 11), pixel_pitch=2e-3, distance=500.0, background_distance=300.0).cameras()[0]

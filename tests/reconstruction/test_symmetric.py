@@ -211,12 +211,3 @@ def test_invalid_axes_are_refused(jet):
             Tikhonov(**wrong)
     with refused("axis_point"):
         Tikhonov(symmetry="axis", axis_point=(99.0, 0.0, 0.0), voxels=16)(one_view(jet))
-
-
-@pytest.mark.slow
-def test_a_resumed_run_equals_a_complete_one(jet):
-    settings = NeRIF(symmetry="axis", max_steps=40)
-    half = settings(one_view(jet), on_step=lambda step: step.step == 20)
-    again = settings(one_view(jet), resume=half.state)
-    points = 20 * torch.rand(50, 3) - 10
-    assert torch.equal(again.field(points), settings(one_view(jet)).field(points))

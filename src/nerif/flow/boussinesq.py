@@ -145,7 +145,7 @@ class Boussinesq:
     def _from_before(
         self, halfway: Spectrum, fields: Float[Tensor, "c z y x"], seconds: float
     ) -> Float[Tensor, "c z y x"]:
-        """Fields (coefficients of splines) at the places from which the fluid comes, by the velocity halfway in time."""
+        """Fields (coefficients of splines) where the fluid comes from, by the velocity halfway in time."""
         box = self.box
         voxels = seconds / torch.tensor(box.spacing[::-1])
         middle = box.nodes - 0.5 * voxels * box.values(halfway).flatten(1).T

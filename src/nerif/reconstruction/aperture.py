@@ -1,4 +1,4 @@
-"""Pixels with an aperture or a correlation window, or as thin rays."""
+"""Aperture and correlation window of pixels, applied or replaced by thin rays."""
 
 from __future__ import annotations
 

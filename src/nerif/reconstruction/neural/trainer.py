@@ -2,7 +2,7 @@
 
     batch of rays with samples (sampling.py) -> loss (objective.py) -> step of the optimiser (optimiser.py)
 
-The schedule (schedule.py) holds steps, time, learning rate and bins of pixels. What becomes of a step is in watch.py.
+The schedule (schedule.py) holds steps, time, learning rate and bins of pixels; watch.py monitors the steps.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What becomes of each step of a training: its figures, the end of the run, rolling back, history and reports.
+"""Monitoring of a training: loss, convergence, divergence, history and progress reports.
 
 A run whose loss turns non-finite, or whose field collapses to the ambient one (fit_monitor.py), continues from its last
 good state with a third of the learning rate.
