@@ -42,12 +42,12 @@ GAUGES: dict[str, dict[str, Any]] = {
     "faces of the file": {},
     "face z-": {"ambient_faces": ("z-",)},
     "region ahead of the shock": {"ambient_region": (-14.0, 14.0, -14.0, 14.0, -15.0, -11.0)},
-    "probe": {"probes": ((0.0, 0.0, -14.0, 1 + STREAM),)},
+    "probe": {"known": ((0.0, 0.0, -14.0, 1 + STREAM),)},
     "face z-, z+ open": {"ambient_faces": ("z-",), "open_faces": ("z+",)},
-    "face z-, all others open, grown 5 mm": {"ambient_faces": ("z-",), "open_faces": FACES, "grow": 5.0},
-    "face z-, all others open, grown 10 mm": {"ambient_faces": ("z-",), "open_faces": FACES, "grow": 10.0},
+    "face z-, all others open, grown 5 mm": {"ambient_faces": ("z-",), "open_faces": FACES, "extend_open_faces": 5.0},
+    "face z-, all others open, grown 10 mm": {"ambient_faces": ("z-",), "open_faces": FACES, "extend_open_faces": 10.0},
     "region, all others open, grown 10 mm": {
-        "ambient_region": (-14.0, 14.0, -14.0, 14.0, -15.0, -11.0), "open_faces": FACES, "grow": 10.0,
+        "ambient_region": (-14.0, 14.0, -14.0, 14.0, -15.0, -11.0), "open_faces": FACES, "extend_open_faces": 10.0,
     },
 }  # fmt: skip
 COLUMNS = {
@@ -189,7 +189,7 @@ def measure(
         if body == "hidden pixels only":
             measurement = replace(measurement, bodies=())
     options = dict(GAUGES[gauge]) if gauge else {}
-    run = Run(report=False, **({"grow": options.pop("grow")} if "grow" in options else {}))
+    run = Run(report=False, extend_open_faces=options.pop("extend_open_faces", 0.0))
     if flow == "cut":
         measurement = replace(measurement, box=Box.cube(30.0))
     reconstructor: Reconstructor = TotalVariation(device="cpu")

@@ -131,7 +131,7 @@ def test_a_mask_is_drawn_taken_back_and_put_in(browser, server, folder):
     wait_for(browser, "return document.querySelectorAll('.over .draft circle').length === 4")
     click(browser, "Close the polygon")
     wait_for(browser, "return document.querySelector('.over polygon.flow') !== null")
-    assert "--drawn" in text(browser, ".command code")
+    assert "--drawings" in text(browser, ".command code")
     click(browser, "Undo")
     wait_for(browser, "return document.querySelector('.over polygon.flow') === null")
     click(browser, "Redo")

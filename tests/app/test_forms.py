@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 
 import pytest
-import tyro
 
 from nerif.app.forms.form import Form
 from nerif.app.forms.form_view import _control_value, _record_value
@@ -13,8 +12,9 @@ from nerif.app.pages.reconstruct import form_of, prepare
 from nerif.cli.commands.design import Design
 from nerif.cli.commands.export import Export
 from nerif.cli.commands.reconstruct import command_of
-from nerif.cli.commands.settings import help_of, parse
+from nerif.cli.settings import help_of, parse
 from nerif.common.conventions import InputError
+from nerif.common.settings import MISSING
 from nerif.geometry import Ring
 from nerif.reconstruction.methods import METHODS
 
@@ -25,7 +25,7 @@ def test_fields_are_those_of_the_record():
     focal = FORM.field("focal_length")
     assert (focal.kind, focal.unit, focal.default, focal.help) == ("number", "mm", 50.0, "Focal length, mm.")
     assert FORM.field("projection").choices == ("perspective", "telecentric")
-    pressure = Form(Export(tyro.MISSING, tyro.MISSING)).field("gas.uniform_pressure")
+    pressure = Form(Export(MISSING, MISSING)).field("gas.uniform_pressure")
     assert (pressure.choices, pressure.optional) == (("auto", "yes", "no"), True)
     assert FORM.field("extra_angles").kind == "words"
     assert FORM.field("views").kind == "integer"
@@ -100,7 +100,7 @@ def test_the_command_line_of_nested_fields_and_switches_gives_the_same_record():
     form = form_of("nerif", "fast")
     values = {"report": False, "network.gradient_head": True, "weights.head": 0.5, "withhold": ["0deg", "20deg"]}
     made = form.build(values)
-    given = dataclasses.replace(form.record, measurement=tyro.MISSING, out=tyro.MISSING)
+    given = dataclasses.replace(form.record, measurement=MISSING, out=MISSING)
     parsed = parse(given, ["m.nc", "-o", "x", *form.arguments(values)], "nerif reconstruct", "")
     assert parsed.run == made.run
     assert parsed.reconstructor == made.reconstructor

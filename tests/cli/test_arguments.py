@@ -8,7 +8,6 @@ import pytest
 
 from nerif.cli.arguments import OPTIONS, check_arguments, table
 from nerif.cli.cli import main
-from nerif.common.conventions import InputError
 from tests.test_imports import HEAVY, loaded_by
 
 

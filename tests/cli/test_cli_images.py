@@ -190,7 +190,7 @@ def test_masks_by_threshold_and_drawn(experiment, tmp_path, capsys, refusal):
     drawing[:10] = 0
     (tmp_path / "drawn").mkdir()
     iio.imwrite(tmp_path / f"drawn/{masked.names[1]}.png", drawing)
-    assert run(*words, tmp_path / "again.nc", "--threshold", "3", "--drawn", tmp_path / "drawn") == 0
+    assert run(*words, tmp_path / "again.nc", "--threshold", "3", "--drawings", tmp_path / "drawn") == 0
     flow_mask = Measurement.read(tmp_path / "again.nc").flow_mask
     assert not flow_mask[1, :10].any()
     assert flow_mask[1, 10:].all()
@@ -198,7 +198,7 @@ def test_masks_by_threshold_and_drawn(experiment, tmp_path, capsys, refusal):
     assert run("mask", tmp_path / "again.nc", "-o", tmp_path / "none.nc", "--remove") == 0
     assert Measurement.read(tmp_path / "none.nc").flow_mask is None
     assert "no flow" in refusal(*words, tmp_path / "empty.nc", "--threshold", "1000")
-    assert "views" in refusal(*words, tmp_path / "empty.nc", "--drawn", tmp_path)
+    assert "views" in refusal(*words, tmp_path / "empty.nc", "--drawings", tmp_path)
     assert not (tmp_path / "empty.nc").exists()
     assert run(*displacement(experiment, "--mask", "4", *QUICK, out=tmp_path / "m.nc")) == 0
     assert 0 < float(Measurement.read(tmp_path / "m.nc").flow_mask.float().mean()) < 1

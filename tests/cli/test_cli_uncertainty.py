@@ -158,7 +158,7 @@ def test_diverged_runs(path, tmp_path, capsys, monkeypatch, diverged):
 
 
 def test_ctrl_c_in_the_second_trial_keeps_the_first_and_resumes(path, result, tmp_path, capsys, monkeypatch):
-    from nerif.cli.commands import output
+    from nerif.cli import output
 
     out, progress_bar = tmp_path / "r", output.progress_bar
 

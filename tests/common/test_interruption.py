@@ -14,7 +14,7 @@ import pytest
 from nerif.cli import arguments
 from nerif.cli.cli import COMMANDS, main
 from nerif.cli.commands import info, output, simulate
-from nerif.cli.commands.output import MONITOR, counting_bar
+from nerif.cli.output import MONITOR, counting_bar
 from nerif.common.files import atomic, written
 from nerif.common.interruption import Interrupted, if_interrupted
 from nerif.reconstruction.field_files import CHECKPOINT, FIELD

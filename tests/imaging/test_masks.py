@@ -177,7 +177,7 @@ def test_masks_of_another_technique_by_threshold_or_drawn(tmp_path, capsys):
     folder.mkdir()
     for name, mask in zip(glow.names, masks.numpy(), strict=True):
         iio.imwrite(folder / f"{name}.png", mask.astype(np.uint8) * 255)
-    assert main(["mask", str(tmp_path / "m.nc"), "-o", str(tmp_path / "k.nc"), "--drawn", str(folder)]) == 0
+    assert main(["mask", str(tmp_path / "m.nc"), "-o", str(tmp_path / "k.nc"), "--drawings", str(folder)]) == 0
     assert "|radiance|" in capsys.readouterr().out
     assert (tmp_path / "k.masks.png").is_file()
     assert torch.equal(Measurement.read(tmp_path / "k.nc").flow_mask, masks)

@@ -50,10 +50,10 @@ def test_a_region_fixes_the_constant(measurement, ball, corner, method):
 @METHODS
 def test_a_known_point_fixes_the_constant(measurement, ball, probe, method):
     *place, index = probe
-    result = replace(method, probes=(probe,))(measurement)
+    result = replace(method, known=(probe,))(measurement)
     excess = float(result.field(torch.tensor([place]))[0])
     assert excess == pytest.approx(index - measurement.n_ambient, rel=0.02)
-    higher = replace(method, probes=((*place, index + 1e-4),))(measurement)
+    higher = replace(method, known=((*place, index + 1e-4),))(measurement)
     points = torch.tensor([measurement.box.centre, place])
     assert float((higher.field(points) - result.field(points)).mean()) == pytest.approx(1e-4, rel=0.1)
 
@@ -92,17 +92,17 @@ def test_a_gauge_that_cannot_be_is_refused(measurement, corner, probe):
         replace(measurement, ambient_region=(x0 - 5.0, *rest))
     with refused("ambient_region"):
         replace(QUICK, ambient_region=(5.0, 0.0, 0.0, 1.0, 0.0, 1.0))
-    with refused("probes"):
-        replace(QUICK, probes=((0.0, 0.0, 0.0, 2.7e-4),))
-    with refused("probes"):
+    with refused("known"):
+        replace(QUICK, known=((0.0, 0.0, 0.0, 2.7e-4),))
+    with refused("known"):
         Gauge.of(measurement, [(1e3, 0.0, 0.0, 1.0)])
     body = cuboid((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
-    with refused("probes"):
+    with refused("known"):
         Gauge.of(replace(measurement, bodies=(body,)), [(0.0, 0.0, 0.0, 1.0)])
     masked = replace(measurement, flow_mask=torch.ones(measurement.shape, dtype=torch.bool))
     masked.flow_mask[:, :8] = False
-    with refused("probes"):
-        replace(SMOOTH, probes=(probe,))(masked)
+    with refused("known"):
+        replace(SMOOTH, known=(probe,))(masked)
     with refused("ambient_faces"):
         QUICK(replace(measurement, ambient_faces=()))
 
@@ -117,5 +117,5 @@ def test_faces_that_are_stated_count_for_techniques_without_a_gauge(measurement)
     )  # fmt: skip
     assert with_gauge(absorbing, QUICK).ambient_faces == ()
     assert with_gauge(absorbing, replace(QUICK, ambient_faces=("z-",))).ambient_faces == ("z-",)
-    with refused("probes"):
-        with_gauge(absorbing, replace(QUICK, probes=((0.0, 0.0, 0.0, 1.0),)))
+    with refused("known"):
+        with_gauge(absorbing, replace(QUICK, known=((0.0, 0.0, 0.0, 1.0),)))

@@ -129,7 +129,7 @@ def test_an_interrupted_run_resumes_to_the_same_result(measurement, tmp_path, in
 
 
 def test_the_command_line_resumes_the_short_run(measurement, tmp_path, capsys, monkeypatch):
-    from nerif.cli.commands import output
+    from nerif.cli import output
 
     measurement.write(tmp_path / "m.nc")
     progress_bar, signals = output.progress_bar, []

@@ -19,7 +19,7 @@ from nerif.workflow.pipeline import reconstruct_into
 from refusals import refused
 
 WHOLE, CUT = Box.cube(40.0), Box((-20.0, -20.0, -20.0), (20.0, 20.0, 2.0))
-QUIET = Run(report=False, withhold=(), detail="off", grow=8.0)
+QUIET = Run(report=False, withhold=(), detail="off", extend_open_faces=8.0)
 SHORT = replace(preset("fast"), max_steps=150, open_faces=("z+",), device="cpu")
 VOXELS = Tikhonov(voxels=20, open_faces=("z+",), device="cpu")
 
@@ -44,7 +44,7 @@ def test_growing_keeps_the_size_of_voxels_and_the_other_ambient_faces(cut):
     assert larger.ambient_faces == ("x-",)
     assert settings.open_faces == ()
     assert settings.voxels == 20  # the longest edge is across
-    with refused("grow"):
+    with refused("extend_open_faces"):
         grown(measurement, replace(SHORT, open_faces=()), 8.0)
 
 
@@ -61,13 +61,13 @@ def test_the_result_is_that_of_the_box(cut, method, tmp_path):
     torch.testing.assert_close(field(points), result.field(points))
     settings = directory.settings()
     assert list(settings["open_faces"]) == ["z+"]
-    assert settings["grow"] == 8.0
+    assert settings["extend_open_faces"] == 8.0
     before = directory.metrics().views
     evaluate(tmp_path / "r", measurement=tmp_path / "m.nc")
     after = directory.metrics().views
     assert [view["rms"] for view in after] == pytest.approx([view["rms"] for view in before], rel=0.02)
     error = {}
-    for name, run in (("grown", QUIET), ("left out", replace(QUIET, grow=0.0))):
+    for name, run in (("grown", QUIET), ("left out", replace(QUIET, extend_open_faces=0.0))):
         found = reconstruct_into(tmp_path / name.replace(" ", "-"), tmp_path / "m.nc", method, run).field(points)
         error[name] = float((found - truth(points)).norm())
     assert error["grown"] < error["left out"]

@@ -745,8 +745,8 @@ def open_faces(field: Field, small: Measurement, voxels: int = 24) -> list[Findi
             findings[face] = Finding(
                 "open_face",
                 f"face {face}: {share:.0%} of the {measured} of rays through it is unexplained, {share_others:.0%} for "
-                f"other rays; the flow seems to extend beyond it: give --open-faces {face} and --grow "
-                f"{growth:.2g} (mm), or a larger box",
+                f"other rays; the flow seems to extend beyond it: give --open-faces {face} and "
+                f"--extend-open-faces {growth:.2g} (mm), or a larger box",
             )
     return [findings[face] for face in suspect_faces if face in findings]
 

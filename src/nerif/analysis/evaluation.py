@@ -98,8 +98,8 @@ def evaluate(
         metrics["truth"] = str(Path(truth).resolve())
     if data is not None:
         settings, stored = directory.settings(), directory.metrics() if directory.has(METRICS) else Metrics()
-        grow, faces = float(settings.get("grow", 0.0)), tuple(settings.get("open_faces", ()))
-        data = replace(data, box=data.box.grown(faces, grow))
+        length, faces = float(settings.get("extend_open_faces", 0.0)), tuple(settings.get("open_faces", ()))
+        data = replace(data, box=data.box.grown(faces, length))
         data, names = withhold_half(data, settings.get("withhold", ()) if withhold is None else withhold, stored.axis)
         unknown = [name for name in names if name not in data.names]
         if unknown and withhold is not None:

@@ -229,7 +229,7 @@ def _complete(view: View) -> bool:
 
 def _fitted_quantities(views: Sequence[View], result: Result) -> list[View]:
     """Return the complete views, without the images of a measurement whose displacements were fitted."""
-    displacements = result.settings.get("source") == "displacements"
+    displacements = result.settings.get("from") == "displacements"
     images = {kind.measured for kind in TECHNIQUES.values() if kind.derived} if displacements else set()
     return [v for v in views if _complete(v) and v["measured"] not in images]
 

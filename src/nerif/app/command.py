@@ -8,12 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-import tyro
-
 from nerif.app.server.guard import ADDRESS
-from nerif.cli.commands.settings import Settings, read_settings
+from nerif.cli.settings import Settings, read_settings
 from nerif.common.conventions import InputError
 from nerif.common.installation import install
+from nerif.common.settings import Append, Positional
 
 __all__ = ["App", "main", "run"]
 
@@ -25,7 +24,7 @@ class App(Settings):
     Each step shows its command line; runs continue when page and server are closed.
     """
 
-    folder: Annotated[Path | None, tyro.conf.Positional] = None
+    folder: Annotated[Path | None, Positional] = None
     """Folder of the project, by default the current one; files outside it are neither read nor written. A result
     directory opens on the page Results."""
     demo: bool = False
@@ -39,7 +38,7 @@ class App(Settings):
     token: str | None = None
     """Token in the address, 16 characters or more; without it a new random one at each start. Other users of this
     machine can read the command line: set the token in a --config file that they cannot read."""
-    allowed_host: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    allowed_host: Annotated[tuple[str, ...], Append] = ()
     """Address of a tunnel or proxy of yours that leads here, with its port, as the browser shows it: localhost:9000,
     hub.example.org. Once for each; all others are refused."""
     root_path: str = ""

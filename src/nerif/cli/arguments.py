@@ -1,23 +1,20 @@
-"""The arguments of a command, checked before anything is imported that takes seconds.
-
-options.json has, for each command and choice of its options, the values of every option; `python -m
-nerif.cli.arguments` writes it from the settings. What is not refused here, the parser of the command checks.
-"""
+"""The words after a command: checks that need no settings, and the values of options."""
 
 from __future__ import annotations
 
-import itertools
-import json
+import difflib
 import os
 import re
-from collections.abc import Callable, Iterator
+import sys
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from nerif.common.conventions import InputError
 from nerif.common.files import ending, instead_of_file
+from nerif.common.settings import FORMER, Append, Developer, Option, Positional
 
-__all__ = ["ALIASES", "INPUTS", "check_arguments", "check_output", "flag_value", "table", "words_of"]
+__all__ = ["INPUTS", "check_arguments", "check_output", "flag_value", "present_name", "values_of"]
 
 MEASUREMENT = "no such file; expected a measurement (NetCDF-4, BOST-1.1)"
 RESULT = "no such directory; expected one written by nerif reconstruct"
@@ -43,20 +40,11 @@ MAKES_INPUT = {"app": "--demo"}
 """Commands with an option that makes the file or folder of their first word."""
 OUTPUTS = ("design", "pattern", "mask", "body", "check", "simulate", "project", "movie", "export")
 """Commands that write a file (--out), and overwrite none without --force."""
-OPTIONS = Path(__file__).with_name("options.json")
-ALIASES: dict[str, str] = {"from": "source", "drawn": "drawings", "known": "probes"}
-"""Further names of options, and those of their fields."""
-VARIANTS = {"reconstruct": ("--method", "METHODS"), "pattern": ("--kind", "KINDS")}
-"""The option on which the others of a command depend, and the name of its choices in the module of the command."""
-FILES = ("--config", "--resume")
-"""Options with which the others of such a command may come from a file."""
-NUMBERS = {"INT": int, "FLOAT": float}
 
 
-def check_arguments(command: str, arguments: list[str]) -> None:
-    """Raise InputError for an input that does not exist, a wrong option or value, or an output file that exists."""
-    first = arguments[0] if arguments else ""
-    words = words_of(arguments)
+def check_arguments(command: str, words: list[str]) -> None:
+    """Raise InputError for an input that does not exist or an output file that exists, before any heavy import."""
+    first = words[0] if words else ""
     if {"-h", "--help"} & {*words}:
         return
     is_read = command in INPUTS and MAKES_INPUT.get(command) not in words
@@ -65,83 +53,9 @@ def check_arguments(command: str, arguments: list[str]) -> None:
             raise InputError(INPUTS[command], field=first)
         if os.path.exists(first) and not (os.path.isfile(first) or os.path.isdir(first)):
             raise InputError(instead_of_file(Path(first)), field=first)
-    _check_options(command, words)
-    out = flag_value(words, "-o", "--out")
+    out = flag_value(words, "out")
     if command in OUTPUTS and out is not None and os.path.isfile(out) and "--force" not in words:
         check_output(Path(out), force=False)
-
-
-def _check_options(command: str, words: list[str]) -> None:
-    values, (variant, _) = dict(_options(words)), VARIANTS.get(command, ("", ""))
-    choice = values.get(variant)
-    commands = json.loads(OPTIONS.read_text(encoding="utf-8"))
-    options = commands.get(f"{command} {variant} {choice}" if choice else command)
-    if options is None or (variant and values.keys() & {*FILES}):
-        return  # a method that is not in the table yet, or one from a file
-    see = f"; see nerif {command} --help"
-    for name in options["required"]:
-        if flag_value(words, name, "-o" if name == "--out" else name) is None and "--config" not in values:
-            raise InputError(f"expected {options[name]}, got none{see}", field=name)
-    for name, value in _options(words):
-        if name not in options:
-            import difflib
-
-            nearest = difflib.get_close_matches(name, options, n=1)
-            guess = f"; did you mean {nearest[0]}?" if nearest else ""
-            raise InputError(f"unknown option{guess}{see}", field=name)
-        kind = options[name]
-        if value in (None, "None"):
-            continue
-        if isinstance(kind, list) and value not in kind:
-            raise InputError(f"expected one of {', '.join(kind)}, got '{value}'{see}", field=name)
-        if isinstance(kind, str) and kind in NUMBERS and not _is_number(value, NUMBERS[kind]):
-            whole = "whole " if kind == "INT" else ""
-            raise InputError(f"expected a {whole}number, got '{value}'{see}", field=name)
-
-
-def words_of(arguments: list[str]) -> list[str]:
-    """Return the arguments of a command, with --set NAME=VALUE as --NAME VALUE and options by the names of fields."""
-    words = [word for pair in _with_set(arguments) for word in pair]
-    return [re.sub(r"^--([\w.-]+)", lambda m: f"--{ALIASES.get(m[1], m[1].replace('_', '-'))}", a) for a in words]
-
-
-def _with_set(arguments: list[str]) -> Iterator[list[str]]:
-    words = iter(arguments)
-    for word in words:
-        if word != "--set":
-            yield [word]
-            continue
-        name, _, value = next(words, "").partition("=")
-        if not name or not value:
-            raise InputError(f"expected NAME=VALUE, such as network.width=128, got '{name}'", field="set")
-        yield [f"--{name}", *value.split()]
-
-
-def flag_value(arguments: list[str], *flags: str) -> str | None:
-    """Return the value of an option before the command line is parsed."""
-    for i, word in enumerate(arguments):
-        for flag in flags:
-            if word == flag and i + 1 < len(arguments):
-                return arguments[i + 1]
-            if flag.startswith("--") and word.startswith(flag + "="):
-                return word.split("=", 1)[1]
-    return None
-
-
-def _options(words: list[str]) -> Iterator[tuple[str, str | None]]:
-    """Yield the options among words, each with its first value."""
-    for word, after in itertools.pairwise([*words, ""]):
-        if match := re.fullmatch(r"(--[a-z][\w.-]*)(?:=(.*))?", word, re.DOTALL):
-            value = match[2] if match[2] is not None else after
-            yield match[1], None if match[2] is None and (not after or after.startswith("--")) else value
-
-
-def _is_number(text: str, kind: type[int] | type[float]) -> bool:
-    try:
-        kind(text)
-    except ValueError:
-        return False
-    return True
 
 
 def check_output(path: Path, force: bool, *others: Path, endings: tuple[str, ...] = ()) -> None:
@@ -162,57 +76,105 @@ def check_output(path: Path, force: bool, *others: Path, endings: tuple[str, ...
             raise InputError("exists already and was left as it is; give another --out, or --force", field=file)
 
 
-def table() -> dict[str, dict[str, Any]]:
-    """Return the table from the settings of all commands."""
-    import importlib
-    from unittest.mock import patch
-
-    from nerif.cli.cli import COMMANDS, MODULES
-    from nerif.cli.commands import settings
-
-    class Parsed(Exception):
-        """The settings of a command."""
-
-    def parse(default: object, *_: object) -> None:
-        raise Parsed(default)
-
-    def parsed(main: Callable[[list[str]], None], *words: str) -> dict[str, Any]:
-        try:
-            main([*words])
-        except Parsed as stop:
-            return _values(stop.args[0])
-        raise AssertionError("a command parses its arguments")
-
-    entries: dict[str, dict[str, Any]] = {}
-    with patch.object(settings, "parse", parse):
-        for command in COMMANDS:
-            module = importlib.import_module(MODULES.get(command, f"nerif.cli.commands.{command}"))
-            entries[command] = parsed(module.main)
-            if command in VARIANTS:
-                variant, choices = VARIANTS[command]
-                entries[command][variant] = [*getattr(module, choices)]
-                for choice in entries[command][variant]:
-                    entries[f"{command} {variant} {choice}"] = parsed(module.main, variant, choice)
-    return entries
+def flag_value(words: list[str], name: str) -> str | None:
+    """Return the value of an option of one word, before the other options of the command are known."""
+    value = None
+    for flag, (first, *_) in ((flag, rest or [""]) for flag, rest in _given(words)):
+        if flag == f"--{name}" and first:
+            value = first
+        elif flag == "--set" and first.startswith(f"{name}="):
+            value = first.partition("=")[2]
+    return value
 
 
-def _values(default: object) -> dict[str, Any]:
-    """Return the options of settings: the choices or kind of their values, "" for none; and those that are required."""
-    import warnings
+def values_of(words: list[str], known: Mapping[str, Option]) -> dict[str, Any]:
+    """Return the values of options by name, as words to be converted.
 
-    import tyro
+    Parameters
+    ----------
+    known : options of the command, by name
+    """
+    values: dict[str, Any] = {}
+    free = [option for option in known.values() if Positional in option.marks]
+    off = {option.off: option.name for option in known.values() if option.kind == "switch"}
+    for flag, rest in _given(words):
+        if flag == "--set":
+            name, _, value = (rest or [""])[0].partition("=")
+            if not name or not value:
+                raise InputError(f"expected NAME=VALUE, such as network.width=128, got '{name}'", field=flag)
+            option, rest = _option(f"--{name}", known, all_options=True), rest[1:]
+            _put(values, option, value.split())
+        elif flag in off:
+            values[off[flag]] = False
+        elif flag:
+            option = _option(flag, known)
+            count = 0 if option.kind == "switch" else option.count
+            _put(values, option, rest[:count] if option.kind != "switch" else ["true"])
+            rest = [] if count is None else rest[count:]
+        for word in rest:
+            if not free:
+                raise InputError(f"expected the name of an option, got '{word}'", field=word)
+            _put(values, free[0], [*values.get(free[0].name, []), word] if free[0].count is None else [word])
+            free = free if free[0].count is None else free[1:]
+    return values
 
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)
-        parser = tyro.extras.get_parser(type(default), default=default)
-    options: dict[str, Any] = {"required": []}
-    for action in parser._actions:
-        kind = sorted(action.choices) if action.choices else action.metavar if action.nargs == 1 else ""
-        names = [name for name in action.option_strings if name.startswith("--") and name != "--help"]
-        options |= dict.fromkeys(names, kind or "")
-        options["required"] += names[:1] if action.required else []
-    return options
+
+def present_name(name: str, known: Collection[str]) -> str:
+    """Return the name of an option, with underscores; a note on standard error where another one takes its place."""
+    name = name.replace("-", "_")
+    now = FORMER.get(name, name)
+    if name in known or now not in known:
+        return name
+    old, new = (word.replace("_", "-") for word in (name, now))
+    print(f"nerif: note: --{old} is now --{new}; the former name is valid until nerif 1.0", file=sys.stderr)
+    return now
 
 
-if __name__ == "__main__":
-    OPTIONS.write_text(json.dumps(table(), indent=1) + "\n", encoding="utf-8")
+def _given(words: list[str]) -> Iterator[tuple[str, list[str]]]:
+    """Yield each option with the words up to the next; first those before any, without one."""
+    flag, rest = "", list[str]()
+    for word in words:
+        if not word.startswith("-") or word == "-" or _is_number(word):
+            rest.append(word)
+            continue
+        yield flag, rest
+        flag, equals, value = word.partition("=")
+        rest = [value] if equals else []
+        if match := re.fullmatch("-o(.*)", flag):
+            flag, rest = "--out", [match[1]] if match[1] else rest
+        flag = flag.replace("_", "-")
+    yield flag, rest
+
+
+def _option(flag: str, known: Mapping[str, Option], all_options: bool = False) -> Option:
+    """Return an option by its name on the command line; those of developers among all options only."""
+    option = known.get(present_name(flag[2:], known))
+    if option is None or Positional in option.marks or not flag.startswith("--"):
+        flags = [option.flag for option in known.values() if Positional not in option.marks]
+        nearest = difflib.get_close_matches(flag, flags, n=1)
+        guess = f"; did you mean {nearest[0]}?" if nearest else ""
+        raise InputError(f"unknown option{guess}", field=flag)
+    if Developer in option.marks and not all_options:
+        raise InputError(f"expected --set {option.name}=VALUE, or {option.name} in a settings file", field=flag)
+    return option
+
+
+def _put(values: dict[str, Any], option: Option, words: list[str]) -> None:
+    if not words and option.count is not None:
+        raise InputError(f"expected {option.values}, got none", field=option.flag)
+    if option.is_table:
+        if len(words) != option.count:
+            raise InputError(f"expected {option.values}, got {' '.join(words)}", field=option.flag)
+        values[option.name] = {**values.get(option.name, {}), words[0]: words[1]}
+    elif Append in option.marks:
+        values[option.name] = [*values.get(option.name, []), *words]
+    else:
+        values[option.name] = option.value(words)
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True

@@ -12,7 +12,7 @@ import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import torch
 from jaxtyping import Float, Int
@@ -20,7 +20,7 @@ from torch import Tensor, nn
 
 from nerif.common.arrays import Points, Values, Vectors
 from nerif.common.conventions import InputError
-from nerif.common.settings import check_settings
+from nerif.common.settings import Developer, check_settings
 from nerif.common.transfer import constant
 from nerif.fields.field import Field
 from nerif.geometry import Box
@@ -135,7 +135,7 @@ class NetworkShape:
     """Whether the three heads for grad(n) exist."""
     activation: Literal[*ACTIVATIONS] = "silu"  # type: ignore[valid-type]
     """Silu, softplus, tanh, relu or sine."""
-    octave_decay: float = 0.0
+    octave_decay: Annotated[float, Developer] = 0.0
     """Weight 2^(-k octave_decay) of octave k of the encoding (paper: 0)."""
 
     def __post_init__(self) -> None:

@@ -41,11 +41,11 @@ def with_gauge(measurement: Measurement, settings: SharedSettings) -> Measuremen
     Settings that state any of the two, or probes, replace both. The faces of the measurement itself count only if a
     technique needs them.
     """
-    if not (settings.ambient_faces or settings.ambient_region or settings.probes):
+    if not (settings.ambient_faces or settings.ambient_region or settings.known):
         faces = ambient_faces(measurement)
         return measurement if faces == measurement.ambient_faces else replace(measurement, ambient_faces=faces)
-    if settings.probes and measurement.quantity != INDEX:
-        raise InputError(f"expected none for {measurement.quantity}, got points with an index", field="probes")
+    if settings.known and measurement.quantity != INDEX:
+        raise InputError(f"expected none for {measurement.quantity}, got points with an index", field="known")
     return replace(measurement, ambient_faces=settings.ambient_faces, ambient_region=settings.ambient_region)
 
 
@@ -207,4 +207,4 @@ def _check_points(measurement: Measurement, points: Float[Tensor, "k 3"]) -> Non
     for wrong, where in ((outside, f"outside the box {lower} to {upper} mm"), (within, "within a body")):
         if bool(wrong.any()):
             got = " ".join(f"{x:g}" for x in points[wrong][0].tolist())
-            raise InputError(f"expected points of the flow, got {got}, {where}", field="probes")
+            raise InputError(f"expected points of the flow, got {got}, {where}", field="known")

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Annotated, Final, Literal
 
 from nerif.common.conventions import ambient_index, parse_faces
-from nerif.common.settings import NonNegative, check_settings
+from nerif.common.settings import NonNegative, OptionName, check_settings
 from nerif.data.measurement_data import Region, check_region
 from nerif.geometry.symmetry import NO_SYMMETRY, parse_symmetry
 from nerif.reconstruction.bounds import check_bounds
@@ -16,7 +16,7 @@ from nerif.reconstruction.rig_parameters import check_refined
 __all__ = ["SHORT_RUN", "Aperture", "SharedSettings", "Source"]
 
 Aperture = Literal["auto", "on", "off"]
-Source = Literal["auto", "images", "displacements", "both"]
+Source = Annotated[Literal["auto", "images", "displacements", "both"], OptionName("from")]
 
 SHORT_RUN: Final = 0.2
 """Share of the limits of a run that its cross-validation run gets."""
@@ -61,8 +61,8 @@ class SharedSettings(Reconstructor):
     ambient_region: Region | None = None
     """Region with ambient index, x0 x1 y0 y1 z0 z1 in mm, such as the stream ahead of a shock; in place of the faces
     of the measurement, unless --ambient-faces names some."""
-    probes: tuple[tuple[float, float, float, float], ...] = ()
-    """Points x y z in mm with the refractive index there (also --known), as 5 0 -20 1.000271; in place of the faces of
+    known: tuple[tuple[float, float, float, float], ...] = ()
+    """Points x y z in mm with the refractive index there, as 5 0 -20 1.000271; in place of the faces of
     the measurement, too."""
     open_faces: tuple[str, ...] = ()
     """Faces through which the flow leaves the box; rays that cross them are excluded."""
@@ -77,6 +77,6 @@ class SharedSettings(Reconstructor):
         parse_faces(self.ambient_faces)
         if self.ambient_region is not None:
             check_region(self.ambient_region)
-        for *_, index in self.probes:
-            ambient_index(index, "probes")
+        for *_, index in self.known:
+            ambient_index(index, "known")
         parse_faces(self.open_faces, "open_faces")

@@ -17,6 +17,7 @@ from nerif.common.conventions import InputError
 from nerif.common.files import atomic, is_near, read_toml, recorded, write_toml
 from nerif.common.installation import command_line, word_of
 from nerif.common.locks import LOCK, locked
+from nerif.common.settings import with_present_names
 from nerif.common.written_files import WARN, WRITTEN, OwnFiles, remove_empty
 from nerif.data.kinds import RESULT, RUN, check_kind
 from nerif.data.measurement import Measurement
@@ -281,7 +282,7 @@ class ResultDirectory:
 
     def settings(self) -> dict[str, Any]:
         """Return run.toml with [about]; empty if there is none."""
-        return read_toml(self.path / RUN) if self.has(RUN) else {}
+        return with_present_names(read_toml(self.path / RUN)) if self.has(RUN) else {}
 
     def metrics(self) -> Metrics:
         """Return metrics.json."""

@@ -20,6 +20,7 @@ from nerif.common.conventions import InputError
 from nerif.common.files import atomic, ending
 from nerif.common.interruption import if_interrupted
 from nerif.common.locks import locked
+from nerif.common.settings import with_present_names
 from nerif.common.times import check_interval, interval, same_instants
 from nerif.data.kinds import SEQUENCE, kind_of
 from nerif.data.measurement_sequence import MeasurementSequence, check_store
@@ -179,8 +180,8 @@ def _projectors(film: VolumeSequence, frames: slice, measurement: str | os.PathL
             "expected the instants of the film, got others; give another --measurement, or --density film",
             field=sequence.path,
         )
-    settings = about.get("settings", {})
-    if settings.get("probes") or settings.get("ambient_region"):
+    settings = with_present_names(about.get("settings", {}))
+    if settings.get("known") or settings.get("ambient_region"):
         raise InputError("its constant is fixed by a region or probes; give --density film", field=film.path)
     options: dict[str, Any] = {
         "open_faces": tuple(settings.get("open_faces", ())),

@@ -17,7 +17,7 @@ from nerif.analysis.prediction import check_sees
 from nerif.common.conventions import InputError, percent
 from nerif.common.installation import command_line, word_of
 from nerif.common.memory import free_memory
-from nerif.common.settings import NonNegative, check_settings
+from nerif.common.settings import NonNegative, check_settings, with_present_names
 from nerif.data.measurement import Measurement
 from nerif.data.volume import Volume, quantities_of
 from nerif.fields.field import Field
@@ -57,7 +57,7 @@ class Run:
     view, in a short run from which the run with all views starts); or none."""
     start_from: Path | None = None
     """Result directory with the initial field: a reconstruction by any method in the same box."""
-    grow: NonNegative = 0.0
+    extend_open_faces: NonNegative = 0.0
     """Millimetres by which the box grows through the open faces (--open-faces) while the field is solved for: rays
     through them are kept. The result is that of the box alone (0: rays through open faces are left out)."""
     fit_gains: bool = False
@@ -104,7 +104,7 @@ class Inputs:
     withheld : names of the other views
     gains : intensity gains by view
     path : of the measurement; None for one in memory
-    box : of the result; that of the data may be larger (grow)
+    box : of the result; that of the data may be larger (extend_open_faces)
     notes : lines on settings that the data limit
     """
 
@@ -126,8 +126,8 @@ class Inputs:
         if not isinstance(measurement, Measurement):
             measurement = Measurement.read(measurement)
         box = measurement.box
-        if run.grow:
-            measurement, reconstructor = grown(measurement, reconstructor, run.grow)
+        if run.extend_open_faces:
+            measurement, reconstructor = grown(measurement, reconstructor, run.extend_open_faces)
         all_views = apply_aperture(measurement, reconstructor.aperture)
         check_source(reconstructor.source, all_views)  # before any view is withheld
         measurement, reconstructor, withheld = with_halves(run.withhold, all_views, reconstructor)
@@ -163,7 +163,8 @@ def grown(measurement: Measurement, reconstructor: Reconstructor, length: float)
     """Return a measurement whose box has grown through the open faces of settings (mm), and settings without them."""
     faces = reconstructor.open_faces if isinstance(reconstructor, SharedSettings) else ()
     if not faces:
-        raise InputError("expected open faces through which the box grows (--open-faces), got none", field="grow")
+        text = "expected open faces through which the box grows (--open-faces), got none"
+        raise InputError(text, field="extend_open_faces")
     box = measurement.box.grown(faces, length)
     changes: dict[str, Any] = {"open_faces": ()}
     if hasattr(reconstructor, "voxels"):  # of the same size
@@ -314,4 +315,5 @@ class Job:
         if "density" not in quantities_of(self.measurement.quantity):
             del settings["gas"]
         file = None if path is None else str(path.resolve())
-        return {"measurement": file, "method": method_name(reconstructor), "voxels": self.voxels, **settings}
+        whole = {"measurement": file, "method": method_name(reconstructor), "voxels": self.voxels, **settings}
+        return with_present_names(whole)

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from html import escape
 from typing import Any, Generic, TypeVar
 
 from nicegui import ui
 
-from nerif.app.forms.form import Form, FormField
+from nerif.app.forms.form import Form, default_of, label_of, unit_of
 from nerif.app.forms.sliders import SliderScale
+from nerif.common.conventions import InputError
+from nerif.common.settings import Option, converted
 
 __all__ = ["FormView"]
 
@@ -96,11 +99,12 @@ class FormView(Generic[T]):
 
         more.on_value_change(fill)
 
-    def _control(self, field: FormField) -> None:
-        value = self.values.get(field.name, field.default)
+    def _control(self, field: Option) -> None:
+        value = self.values.get(field.name, default_of(field))
         with ui.element("div").classes("field"):
             control = self._control_of(field, _control_value(field, value))
-            label = f"{field.label}{f' ({field.unit})' if field.unit else ''}"
+            unit = unit_of(field)
+            label = label_of(field) + (f" ({unit})" if unit else "")
             control.props["name"], control.props["aria-label"] = field.name, label
             control.on_value_change(lambda event: self._set_value(field, _record_value(field, event.value)))
             self._controls[field.name] = control
@@ -110,7 +114,7 @@ class FormView(Generic[T]):
             if field.help:
                 ui.html(f"<p>{escape(field.help)}</p>", sanitize=False).classes("help")
 
-    def _slider(self, field: FormField, control: Any, label: str) -> None:
+    def _slider(self, field: Option, control: Any, label: str) -> None:
         """Add a slider of the browser, which has keys and screen reader support."""
         scale = SliderScale(*self.sliders[field.name], whole=field.kind == "integer")
         slider = ui.element("input").classes("range").props("type=range min=0 step=1")
@@ -125,7 +129,7 @@ class FormView(Generic[T]):
             value = control.value
             if not isinstance(value, int | float):
                 return
-            slider.props["aria-valuetext"] = f"{value:g} {field.unit}"
+            slider.props["aria-valuetext"] = f"{value:g} {unit_of(field)}"
             if [value] != position:  # not while the slider is moved
                 slider.props["value"] = scale.step(value)
 
@@ -133,58 +137,42 @@ class FormView(Generic[T]):
         control.on_value_change(follow)
         follow()
 
-    def _control_of(self, field: FormField, value: Any) -> Any:
+    def _control_of(self, field: Option, value: Any) -> Any:
         """Return the control for the kind of the field."""
-        label = field.label
+        label, unit = label_of(field), unit_of(field) or None
         if field.kind == "switch":
             return ui.switch(label, value=bool(value))
         if field.kind == "choice":
             choice = ui.select(list(field.choices), label=label, value=value, clearable=field.optional)
             return choice.props("outlined dense options-dense")
         if field.kind in ("number", "integer"):
-            control = ui.number(label, value=value, suffix=field.unit or None)
+            control = ui.number(label, value=value, suffix=unit)
             return control.props('outlined dense debounce=150 step="any"')
-        return ui.input(label, value=value, suffix=field.unit or None).props("outlined dense debounce=250")
+        return ui.input(label, value=value, suffix=unit).props("outlined dense debounce=250")
 
-    def _set_value(self, field: FormField, value: Any) -> None:
-        if self.values.get(field.name, field.default) == value:
+    def _set_value(self, field: Option, value: Any) -> None:
+        if self.values.get(field.name, default_of(field)) == value:
             return
         self.values[field.name] = value
         self.check()
         self.on_change()
 
 
-def _control_value(field: FormField, value: Any) -> Any:
+def _control_value(field: Option, value: Any) -> Any:
     """Return the value of a field in the form of its control."""
     if field.kind == "words":
         return " ".join(f"{v:g}" if isinstance(v, float) else str(v) for v in value or ())
     return ("" if value is None else str(value)) if field.kind == "text" else value
 
 
-def _record_value(field: FormField, value: Any) -> Any:
+def _record_value(field: Option, value: Any) -> Any:
     """Return the value of a control in the type of the record, which rejects invalid input."""
-    if field.kind == "integer" and isinstance(value, float) and value.is_integer():
-        return int(value)
-    if field.kind == "number" and isinstance(value, int):
-        return float(value)
     if field.kind == "words":
-        words = str(value or "").replace(",", " ").split()
-        return None if field.optional and not words else [_number(word, field) for word in words]
-    if field.kind == "text" and field.optional and not str(value or "").strip():
+        value = str(value or "").replace(",", " ").split()
+    elif field.kind == "text":
+        value = str(value or "")
+    if field.optional and not value and field.kind in ("words", "text"):
         return None
+    with suppress(InputError):
+        return converted(field.hint, value, field.name)
     return value
-
-
-def _number(word: str, field: FormField) -> Any:
-    """Return a number where the default has numbers, else the word."""
-    numeric = not field.default or all(isinstance(v, int | float) for v in field.default)
-    if not numeric:
-        return word
-    for kind in (int, float):
-        try:
-            number = kind(word)
-        except ValueError:
-            continue
-        whole = kind is int and any(isinstance(v, float) for v in field.default or ())
-        return float(number) if whole else number
-    return word

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import fields
 from typing import Any
 
-import tyro
 from nicegui import ui
 
 from nerif.app.forms.elements import CommandLine, card, refusals, select, text_html
@@ -19,10 +18,10 @@ from nerif.app.project.workspace import Workspace
 from nerif.app.views.calibration_images import CalibrationImages
 from nerif.app.views.rig_scene import read_rig, show_rig
 from nerif.cli.commands.calibrate import Calibrate
-from nerif.cli.commands.settings import merge
 from nerif.common.conventions import InputError
 from nerif.common.files import read_toml
 from nerif.common.installation import word_of
+from nerif.common.settings import MISSING, merge
 from nerif.imaging.calibration.result import ImageError
 from nerif.imaging.calibration.simple_rig import SimpleRig
 from nerif.imaging.calibration.targets import CalibrationTarget
@@ -43,7 +42,7 @@ EVERY = 0.7  # seconds
 
 def form_of(simple: bool, settings: dict[str, Any] | None = None) -> Form[Calibrate]:
     """Return the form of one of the two ways; its defaults are those of a file of settings, if there is one."""
-    record = Calibrate(tyro.MISSING)
+    record = Calibrate(MISSING)
     if simple:
         return Form(record, only=SIMPLE)
     record = merge(record, settings or {}, SETTINGS)

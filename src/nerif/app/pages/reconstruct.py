@@ -8,7 +8,6 @@ from html import escape
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-import tyro
 from nicegui import ui
 
 from nerif.app.forms.elements import CommandLine, FileChoice, card, refusals, select, text_html
@@ -22,6 +21,7 @@ from nerif.cli.commands.sequence import Sequence
 from nerif.common.conventions import InputError
 from nerif.common.files import ending
 from nerif.common.installation import word_of
+from nerif.common.settings import MISSING
 from nerif.data.measurement_sequence import MeasurementSequence
 from nerif.reconstruction.methods import METHODS
 from nerif.reconstruction.neural.presets import PRESETS, preset
@@ -31,12 +31,12 @@ from nerif.workflow.job import Job
 
 __all__ = ["PAGE"]
 
-WITHOUT = ("config", "measurement", "out", "method", "preset", "force", "resume", "live", "probes")
+WITHOUT = ("config", "measurement", "out", "method", "preset", "force", "resume", "live", "known")
 MAIN = ("time_limit", "withhold", "uncertainty", "voxels")
 FILM = ".zarr"
 EVERY = 1.0  # seconds
 VALUES = {False: "values", True: "film_values"}  # key of the settings in the draft: of one instant, of a film
-FILM_WITHOUT = ("config", "measurement", "out", "preset", "force", "time_limit", "refine", "probes")
+FILM_WITHOUT = ("config", "measurement", "out", "preset", "force", "time_limit", "refine", "known")
 FILM_MAIN = ("cluster", "workers", "chunk", "withhold", "voxels")
 
 
@@ -47,7 +47,7 @@ def titles() -> dict[str, str]:
 
 def form_of(method: str, preset_name: str) -> Form[Reconstruct]:
     """Return the form of a method; the defaults of NeRIF are those of its preset."""
-    record = command_of(method)(measurement=tyro.MISSING, out=tyro.MISSING, method=method)
+    record = command_of(method)(measurement=MISSING, out=MISSING, method=method)
     if method == "nerif":
         record = replace(record, reconstructor=preset(preset_name), preset=preset_name)  # type: ignore[call-arg]
     return Form(record, without=WITHOUT)
@@ -55,7 +55,7 @@ def form_of(method: str, preset_name: str) -> Form[Reconstruct]:
 
 def form_of_film(preset_name: str) -> Form[Sequence]:
     """Return the form of a film: where its frames are reconstructed, and how."""
-    record = Sequence(tyro.MISSING, tyro.MISSING, preset=preset_name, reconstructor=preset(preset_name))
+    record = Sequence(MISSING, MISSING, preset=preset_name, reconstructor=preset(preset_name))
     return Form(record, without=FILM_WITHOUT)
 
 

@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import PurePosixPath
 from typing import Any
 
-import tyro
 from nicegui import ui
 
 from nerif.app.forms.elements import CommandLine, card, figures, refusals, select, text_html
@@ -22,6 +21,7 @@ from nerif.cli.commands.export import Export
 from nerif.cli.commands.figures import Figures
 from nerif.cli.commands.movie import MovieCommand
 from nerif.common.installation import install, word_of
+from nerif.common.settings import MISSING
 from nerif.data.volume import FORMATS
 
 __all__ = ["PAGE"]
@@ -175,12 +175,12 @@ class ResultsPage:
         name.on_value_change(job_form.show)
 
     def _volume(self) -> None:
-        form = Form(Export(tyro.MISSING, tyro.MISSING), without=("config", "result", "out", "force"))
+        form = Form(Export(MISSING, MISSING), without=("config", "result", "out", "force"))
         formats = {ending: PROGRAMS.get(ending, ending) for ending in FORMATS}
         self._file_form("export", form, formats, "Export", ("voxels", "quantities"))
 
     def _figures(self) -> None:
-        record = Figures(tyro.MISSING)
+        record = Figures(MISSING)
         form = Form(record, without=("config", "result", "out"))
         with ui.element("div").classes("form"):
             text_html(f"They are written to {self.row.title}/figures.", classes="note")
@@ -190,7 +190,7 @@ class ResultsPage:
             )  # fmt: skip
 
     def _movie(self) -> None:
-        record = MovieCommand(tyro.MISSING, tyro.MISSING)
+        record = MovieCommand(MISSING, MISSING)
         form = Form(record, without=("config", "result", "out", "force"))
         formats = {".mp4": "H.264 (.mp4)", ".gif": "GIF (.gif)"}
         self._file_form("movie", form, formats, "Make the movie", ("style", "every"))

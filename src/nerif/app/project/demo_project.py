@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from nerif.app.project.folder import OWN
-from nerif.cli.commands.output import counting_bar, say
+from nerif.cli.output import counting_bar, say
 from nerif.common.conventions import AMBIENT_INDEX, InputError
 from nerif.common.files import read_json, write_json
 from nerif.common.interruption import if_interrupted

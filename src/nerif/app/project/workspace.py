@@ -12,7 +12,7 @@ from typing import Any, ParamSpec, TypeVar
 from nerif.app.project.folder import OWN, Contents, ProjectFolder
 from nerif.app.project.image_cache import ImageCache
 from nerif.app.project.jobs import Jobs
-from nerif.cli.commands.settings import COMMAND_LINE_ONLY
+from nerif.cli.settings import COMMAND_LINE_ONLY
 from nerif.common.files import write_json
 from nerif.common.locks import locked
 

@@ -27,7 +27,7 @@ from nerif.app.project.workspace import READ_ONLY, Workspace
 from nerif.app.server.guard import Guard
 from nerif.app.server.private import page_leading_to
 from nerif.app.views.routes import routes
-from nerif.cli.commands.output import say
+from nerif.cli.output import say
 from nerif.common.conventions import InputError
 
 __all__ = ["Address", "is_relevant", "serve"]

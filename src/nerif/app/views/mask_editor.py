@@ -123,7 +123,7 @@ class MaskCard:
         return self.work.project.free_name(f"{self.name.removesuffix('.nc')}.masked.nc")
 
     def _words(self) -> list[str]:
-        option = ["--drawn", self.folder] if self.edits.changes else []
+        option = ["--drawings", self.folder] if self.edits.changes else []
         return ["mask", self.name, "--out", self.out, *option]
 
     def _build_editor(self) -> None:

@@ -8,14 +8,14 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import torch
-import tyro
 from annotated_types import Ge
 
 from nerif.cli.arguments import check_output
-from nerif.cli.commands.output import counting_bar, say
-from nerif.cli.commands.settings import Settings, command
+from nerif.cli.output import counting_bar, say
+from nerif.cli.settings import Settings, command
 from nerif.common.conventions import InputError
 from nerif.common.locks import locked
+from nerif.common.settings import Positional
 from nerif.data.body_file import read_body
 from nerif.data.measurement import Measurement
 from nerif.data.measurement_sequence import MeasurementSequence
@@ -37,11 +37,11 @@ class BodyInFlow(Settings):
     Pixels that see a body have no data any more. The reconstruction is NaN within it.
     """
 
-    measurement: tyro.conf.Positional[Path]
+    measurement: Annotated[Path, Positional]
     """Measurement file, or film (.zarr)."""
-    models: tyro.conf.Positional[tuple[Path, ...]] = ()
+    models: Annotated[tuple[Path, ...], Positional] = ()
     """Closed surfaces of triangles (.stl, .obj, .ply), one or more."""
-    out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    out: Path | None = None
     """Measurement to write, NAME.nc (a film: NAME.zarr), with a figure NAME.bodies.png."""
     unit: Literal["mm", "cm", "m", "in"] | None = None
     """Unit of the lengths in the files (default: mm, and a size that does not suit the box is refused)."""

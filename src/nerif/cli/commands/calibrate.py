@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import Annotated
 
 import torch
-import tyro
 
 from nerif.cli.arguments import check_output
-from nerif.cli.commands.output import counting_bar, say
-from nerif.cli.commands.settings import Flat, Settings, command
+from nerif.cli.output import counting_bar, say
+from nerif.cli.settings import Settings, command
 from nerif.common.conventions import InputError
 from nerif.common.files import ending
+from nerif.common.settings import Flat, Positional
 from nerif.data.cameras_file import CalibratedCamera, write_cameras
 from nerif.data.measurement import Measurement
 from nerif.geometry import Box, Camera
@@ -41,9 +41,9 @@ class Calibrate(Settings):
     axis of a flow, follows from --distance, --background-distance and --mm-per-px.
     """
 
-    source: tyro.conf.Positional[Path]
+    source: Annotated[Path, Positional]
     """Folder of images, calibration file, measurement (--check) or image (--simple)."""
-    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("calibration.toml")
+    out: Path = Path("calibration.toml")
     """Output file NAME.toml, with NAME.rig.png and NAME.errors.png."""
     check: bool = False
     """Only draw cameras, box and background planes to NAME.rig.png, which shows mirrored axes."""

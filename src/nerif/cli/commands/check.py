@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-import tyro
 from annotated_types import Ge
 
 from nerif.analysis.consistency import Consistency, check_consistency, corrected
@@ -14,11 +13,11 @@ from nerif.analysis.consistency_file import CheckFindings, read_findings, write_
 from nerif.analysis.film_check import check_film
 from nerif.analysis.rig_check import RigCheck, check_rig
 from nerif.cli.arguments import check_output
-from nerif.cli.commands.output import MONITOR, counting_bar, say
-from nerif.cli.commands.settings import Settings
+from nerif.cli.output import MONITOR, counting_bar, say
+from nerif.cli.settings import Settings
 from nerif.common.conventions import InputError
 from nerif.common.files import ending
-from nerif.common.settings import Positive
+from nerif.common.settings import Positional, Positive
 from nerif.data.measurement import Measurement
 from nerif.data.measurement_sequence import MeasurementSequence
 from nerif.reconstruction.shared_settings import Aperture
@@ -38,7 +37,7 @@ class Check(Settings):
     are then compared at one instant.
     """
 
-    measurement: tyro.conf.Positional[Path]
+    measurement: Annotated[Path, Positional]
     """Measurement file (.nc), or measurement over time (.zarr)."""
     voxels: Annotated[int, Ge(8)] = 24
     """Voxels of the quick reconstructions along the longest edge of the box."""
@@ -53,7 +52,7 @@ class Check(Settings):
     """With --refine: standard deviation of orientations, degrees (default: that of the measurement, else 0.02)."""
     time_limit: Positive = 30.0
     """With --refine: time limit in seconds."""
-    out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    out: Path | None = None
     """Corrected measurement to write, NAME.nc, without its images of the pattern."""
     findings: Path | None = None
     """File NAME.json to write: agreement of each view, faults, notes. Earlier findings of the same measurement are

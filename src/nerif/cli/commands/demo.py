@@ -9,13 +9,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-import tyro
 from annotated_types import Ge
 
-from nerif.cli.commands.output import say
-from nerif.cli.commands.settings import Settings, command
+from nerif.cli.output import say
+from nerif.cli.settings import Settings, command
 from nerif.common.conventions import InputError
 from nerif.common.installation import command_line, install
+from nerif.common.settings import Positional
 from nerif.common.written_files import OwnFiles
 from nerif.data.samples import SAMPLES, sample
 from nerif.results.directory import REPORT, ResultDirectory
@@ -105,9 +105,9 @@ DEMOS = {
 class Demo(Settings):
     """Reconstruct a simulated flame or a real flow that comes with nerif, by the commands that are printed."""
 
-    name: Annotated[Literal[*DEMOS], tyro.conf.Positional] = "flame"  # type: ignore[valid-type]
+    name: Annotated[Literal[*DEMOS], Positional] = "flame"  # type: ignore[valid-type]
     """Name of the demo; --list describes them."""
-    out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    out: Path | None = None
     """Directory to write (default: out/NAME)."""
     steps: Annotated[int, Ge(0)] = 0
     """Training steps (0: as many as the demo needs)."""

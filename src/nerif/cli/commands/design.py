@@ -6,11 +6,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
-import tyro
-
 from nerif.cli.arguments import check_output
-from nerif.cli.commands.output import say
-from nerif.cli.commands.settings import Flat, Settings, command
+from nerif.cli.output import say
+from nerif.cli.settings import Settings, command
+from nerif.common.settings import Flat
 from nerif.data.body_file import read_body
 from nerif.geometry import Ring
 from nerif.geometry.body import hidden_pixels
@@ -23,7 +22,7 @@ __all__ = ["Design", "main", "run"]
 class Design(Settings):
     """Predict displacement, sensitivity, field of view, blur and spatial resolution of a rig."""
 
-    out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    out: Path | None = None
     """Drawing to write, .png or .pdf."""
     force: bool = False
     """Overwrite an existing drawing."""

@@ -7,16 +7,15 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
 
-import tyro
 from annotated_types import Ge
 
 from nerif.cli.arguments import check_output
-from nerif.cli.commands.output import counting_bar, say
-from nerif.cli.commands.settings import Flat, Settings, command
+from nerif.cli.output import counting_bar, say
+from nerif.cli.settings import Settings, command
 from nerif.common.conventions import InputError
 from nerif.common.interruption import if_interrupted
 from nerif.common.locks import locked
-from nerif.common.settings import Count, NonNegative
+from nerif.common.settings import Count, Flat, NonNegative, Positional
 from nerif.data.measurement import Measurement
 from nerif.data.measurement_sequence import MeasurementSequence
 from nerif.data.measurement_summary import valid_pixels
@@ -44,11 +43,11 @@ class Displacement(Settings):
     background).
     """
 
-    folder: tyro.conf.Positional[Path]
+    folder: Annotated[Path, Positional]
     """Folder of the experiment."""
     calibration: Path
     """Calibrated cameras with the names of the views: output of nerif calibrate, or any file that it imports."""
-    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    out: Path
     """Measurement to write, NAME.nc, with a figure NAME.png; with --frames NAME.zarr."""
     lower: tuple[float, float, float] | None = None
     """Lower corner x y z of the box to reconstruct, mm (default: box of the calibration)."""
@@ -60,7 +59,7 @@ class Displacement(Settings):
     """Number of the flow image."""
     frames: str = ""
     """Flow images of a sequence: all, or FIRST:LAST (LAST excluded); requires --out NAME.zarr."""
-    frame_offset: tyro.conf.UseAppendAction[dict[str, int]] = field(default_factory=dict)
+    frame_offset: dict[str, int] = field(default_factory=dict)
     """View and offset of its film, such as cam3 -2: number i is flow image i - 2 of cam3. Once for each view; replaces
     frame_offset of views.toml."""
     frame_rate: float = 0.0

@@ -7,13 +7,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import tyro
-
 from nerif.analysis.evaluation import FLOW, evaluate, rms_with_unit
-from nerif.cli.commands.output import counting_bar, say
-from nerif.cli.commands.settings import Settings, command
+from nerif.cli.output import counting_bar, say
+from nerif.cli.settings import Settings, command
 from nerif.common.conventions import InputError
 from nerif.common.files import ending
+from nerif.common.settings import Positional
 from nerif.data.volume import INDEX, name_of
 from nerif.results.metrics_file import ViewScores
 
@@ -24,7 +23,7 @@ __all__ = ["Evaluate", "main", "run"]
 class Evaluate(Settings):
     """Compare a reconstruction with a true field or with measured views, and add the metrics to its metrics.json."""
 
-    result: Annotated[Path, tyro.conf.Positional]
+    result: Annotated[Path, Positional]
     """Result directory of nerif reconstruct, or store of nerif sequence (.zarr)."""
     truth: Path | None = None
     """Volume of the true field (.nc, .vti), compared on its grid; NAME.truth.zarr for a sequence."""

@@ -6,13 +6,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
-import tyro
-
 from nerif.cli.arguments import check_output
-from nerif.cli.commands.output import counting_bar, say
-from nerif.cli.commands.settings import Settings, command
+from nerif.cli.output import counting_bar, say
+from nerif.cli.settings import Settings, command
 from nerif.common.conventions import InputError
 from nerif.common.files import ending
+from nerif.common.settings import Positional
 from nerif.data.geometry_export import PROGRAMS, export_geometry
 from nerif.data.measurement import Measurement
 from nerif.data.velocity_sequence import export_frame
@@ -31,9 +30,9 @@ class Export(Settings):
     With --format astra or tigre, write cameras and grid of a measurement as the geometry of that program.
     """
 
-    result: Annotated[Path, tyro.conf.Positional]
+    result: Annotated[Path, Positional]
     """Result directory of nerif reconstruct, or volumes over time (.zarr); for astra and tigre a measurement (.nc)."""
-    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    out: Path
     """Output file; format by its ending: .vti, .nc, .npz, .mat or .csv; for astra and tigre .npz."""
     format: Literal["field", *PROGRAMS] = "field"  # type: ignore[valid-type]
     """What to write: the field, or cameras and grid for astra or tigre."""

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-import tyro
 from annotated_types import Ge, Le
 
-from nerif.cli.commands.output import counting_bar, say
-from nerif.cli.commands.settings import Settings, command
+from nerif.cli.output import counting_bar, say
+from nerif.cli.settings import Settings, command
 from nerif.common.conventions import InputError
+from nerif.common.settings import Positional
 from nerif.report.journal_figures import JOURNALS, save_figures
 from nerif.results.directory import FIGURES, ResultDirectory
 
@@ -22,9 +22,9 @@ __all__ = ["Figures", "main", "run"]
 class Figures(Settings):
     """Write every figure of a result as vector PDF and PNG at journal column widths."""
 
-    result: Annotated[Path, tyro.conf.Positional]
+    result: Annotated[Path, Positional]
     """Result directory of nerif reconstruct."""
-    out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    out: Path | None = None
     """Folder to write (default: RESULT/figures)."""
     journal: Literal[*JOURNALS] = "elsevier"  # type: ignore[valid-type]
     """Journal whose column widths are used."""

@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Annotated
 
 import torch
-import tyro
 from torch import Tensor
 
 from nerif.analysis.evaluation import rms_with_unit
-from nerif.cli.commands.output import say
-from nerif.cli.commands.settings import Settings, command
+from nerif.cli.output import say
+from nerif.cli.settings import Settings, command
 from nerif.common.conventions import percent, with_unit
+from nerif.common.settings import Positional
 from nerif.data.kinds import MEASUREMENT, RESULT, SEQUENCE, VOLUME, check_kind, kind_of
 from nerif.data.measurement import Measurement
 from nerif.data.measurement_sequence import MeasurementSequence
@@ -31,7 +31,7 @@ __all__ = ["Info", "main", "run"]
 class Info(Settings):
     """Describe a measurement, a measurement over time, a volume or a result directory."""
 
-    path: Annotated[Path, tyro.conf.Positional]
+    path: Annotated[Path, Positional]
     """Measurement (.nc; over time .zarr), volume (.nc, .vti) or result directory."""
 
 

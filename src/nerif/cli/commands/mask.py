@@ -6,11 +6,10 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
 
-import tyro
-
 from nerif.cli.arguments import check_output
-from nerif.cli.commands.output import counting_bar, say
-from nerif.cli.commands.settings import Flat, Settings, command
+from nerif.cli.output import counting_bar, say
+from nerif.cli.settings import Settings, command
+from nerif.common.settings import Flat, Positional
 from nerif.data.measurement import Measurement
 from nerif.geometry import Grid
 from nerif.imaging.masks import MaskSettings, drawn_masks, with_flow_masks
@@ -26,12 +25,12 @@ class Mask(Settings):
     Pixels without valid data are inside the mask, since flow may be there.
     """
 
-    measurement: tyro.conf.Positional[Path]
+    measurement: Annotated[Path, Positional]
     """Measurement file."""
-    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    out: Path
     """Measurement to write, NAME.nc, with a figure NAME.masks.png."""
     drawings: Path | None = None
-    """Folder (also --drawn) with an image VIEW.png per view (white: flow); views without one use the threshold."""
+    """Folder with an image VIEW.png per view (white: flow); views without one use the threshold."""
     sigma: float | None = None
     """Noise of a measurement without sigma, in the unit of its values (px for displacements)."""
     remove: bool = False

@@ -6,12 +6,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
-import tyro
-
 from nerif.cli.arguments import check_output
-from nerif.cli.commands.output import counting_bar, say
-from nerif.cli.commands.settings import Flat, Settings, command
-from nerif.common.settings import Count
+from nerif.cli.output import counting_bar, say
+from nerif.cli.settings import Settings, command
+from nerif.common.settings import Count, Flat, Positional
 from nerif.data.velocity_sequence import open_volumes
 from nerif.report.movie import Movie, finished_frames
 
@@ -22,9 +20,9 @@ __all__ = ["MovieCommand", "main", "run"]
 class MovieCommand(Settings):
     """Draw an isosurface or slices of a sequence over time as .mp4 or .gif, without a window."""
 
-    result: Annotated[Path, tyro.conf.Positional]
+    result: Annotated[Path, Positional]
     """Result of nerif sequence (.zarr), complete or not, true field of nerif simulate --times, or velocity."""
-    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    out: Path
     """Movie to write: NAME.mp4 (H.264) or NAME.gif."""
     every: Count = 1
     """Draw every Nth frame."""

@@ -6,12 +6,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
-import tyro
-
 from nerif.cli.arguments import check_output
-from nerif.cli.commands.output import say
-from nerif.cli.commands.settings import Flat, Settings, read_settings, setting_of
+from nerif.cli.output import say
+from nerif.cli.settings import Settings, read_settings, setting_of
 from nerif.common.conventions import InputError
+from nerif.common.settings import MISSING, Flat
 from nerif.imaging import patterns as background
 from nerif.imaging.calibration import targets
 from nerif.imaging.calibration.targets import CalibrationTarget
@@ -27,7 +26,7 @@ KINDS = (*background.KINDS, *targets.KINDS)
 class Pattern(Settings):
     """Settings of every kind of pattern."""
 
-    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    out: Path
     """File to write, in true size: .pdf (with a scale bar) or .png."""
     dpi: float = 600.0
     """Resolution in dots per inch; reduced where a dot has 12 pixels already."""
@@ -68,6 +67,6 @@ def main(arguments: list[str]) -> None:
     if kind not in KINDS:
         raise InputError(f"expected one of {', '.join(KINDS)}, got '{kind}'", field="kind")
     if kind in targets.KINDS:
-        run(read_settings(PrintTarget(tyro.MISSING, pattern=CalibrationTarget(kind)), arguments, "pattern"))
+        run(read_settings(PrintTarget(MISSING, pattern=CalibrationTarget(kind)), arguments, "pattern"))
     else:
-        run(read_settings(PrintBackground(tyro.MISSING, pattern=Background(kind)), arguments, "pattern"))
+        run(read_settings(PrintBackground(MISSING, pattern=Background(kind)), arguments, "pattern"))

@@ -6,13 +6,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
-import tyro
-
 from nerif.analysis.prediction import predict
 from nerif.cli.arguments import check_output
-from nerif.cli.commands.output import counting_bar, say
-from nerif.cli.commands.settings import Flat, Settings, command
+from nerif.cli.output import counting_bar, say
+from nerif.cli.settings import Settings, command
 from nerif.common.conventions import InputError, with_unit
+from nerif.common.settings import Flat, Positional
 from nerif.data.measurement import Measurement
 from nerif.forward.registry import AUTO, model_of, technique, technique_of
 from nerif.geometry import Ring
@@ -27,9 +26,9 @@ __all__ = ["Project", "main", "run"]
 class Project(Settings):
     """Predict the measurement of a reconstruction by given cameras, and write it."""
 
-    result: Annotated[Path, tyro.conf.Positional]
+    result: Annotated[Path, Positional]
     """Result directory of nerif reconstruct."""
-    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    out: Path
     """Measurement to write, NAME.nc."""
     cameras: Path | None = None
     """Measurement file with the cameras (default: the ring of cameras below)."""

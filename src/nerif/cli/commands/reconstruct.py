@@ -12,15 +12,13 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import psutil
-import tyro
 
 from nerif.cli.arguments import flag_value
-from nerif.cli.commands.help import after_help
-from nerif.cli.commands.output import MONITOR
-from nerif.cli.commands.settings import Flat, Settings, read_settings, setting_of
+from nerif.cli.output import MONITOR
+from nerif.cli.settings import Settings, read_settings, setting_of
 from nerif.common.conventions import InputError
 from nerif.common.installation import install
-from nerif.common.settings import Count
+from nerif.common.settings import MISSING, Count, Flat, NoOption, Positional
 from nerif.reconstruction.methods import METHODS
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.neural.presets import PRESETS, preset
@@ -38,9 +36,9 @@ SCALAR_STEPS, SCALAR_SECONDS = 20, 5.0  # between TensorBoard scalars, whichever
 class Reconstruct(Settings):
     """Reconstruct the field of a measurement and write a result directory."""
 
-    measurement: Annotated[Path, tyro.conf.Positional]
+    measurement: Annotated[Path, Positional]
     """Measurement file (.nc); may be omitted with --resume."""
-    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    out: Path
     """Result directory to write."""
     method: Literal[*METHODS] = "nerif"  # type: ignore[valid-type]
     """Reconstruction method; --method NAME --help lists its options."""
@@ -53,7 +51,7 @@ class Reconstruct(Settings):
     live: bool = False
     """Write OUT/live.json and OUT/live.npz during the run, for nerif app."""
     run: Annotated[Run, Flat] = field(default_factory=Run)
-    reconstructor: Annotated[Reconstructor, tyro.conf.Suppress] = field(default_factory=NeRIF)
+    reconstructor: Annotated[Reconstructor, NoOption] = field(default_factory=NeRIF)
 
 
 @dataclass(frozen=True)
@@ -134,18 +132,16 @@ def _scalars(settings: Reconstruct) -> Iterator[OnStep | None]:
 
 def main(arguments: list[str]) -> None:
     """Parse and run."""
-    file, out = None, flag_value(arguments, "-o", "--out")
-    if "--resume" in arguments and flag_value(arguments, "--config") is None and out is not None:
+    file, out = None, flag_value(arguments, "out")
+    if "--resume" in arguments and flag_value(arguments, "config") is None and out is not None:
         file = Path(out) / RUN
         if not file.is_file():
             raise InputError(f"expected an interrupted run to resume, got no {RUN} in it", field=out)
     method = setting_of("method", arguments, "nerif", file)
     command = command_of(method)
-    defaults: dict[str, Any] = {"measurement": tyro.MISSING, "out": tyro.MISSING, "method": method}
+    defaults: dict[str, Any] = {"measurement": MISSING, "out": MISSING, "method": method}
     if method == "nerif":
         name = setting_of("preset", arguments, "auto", file)
         defaults |= {"preset": name, "reconstructor": preset(name)}
-    default = command(**defaults)
-    arguments = after_help(arguments, default, "nerif reconstruct")
-    if run(read_settings(default, arguments, "reconstruct", file)).outcome.failed:
+    if run(read_settings(command(**defaults), arguments, "reconstruct", file)).outcome.failed:
         raise SystemExit(1)

@@ -7,13 +7,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
-import tyro
-
-from nerif.cli.commands.output import counting_bar, say
-from nerif.cli.commands.settings import Flat, Settings, command
+from nerif.cli.output import counting_bar, say
+from nerif.cli.settings import Settings, command
 from nerif.common.conventions import AMBIENT_INDEX
 from nerif.common.installation import command_line, word_of
 from nerif.common.interruption import if_interrupted
+from nerif.common.settings import Flat
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Ring
 from nerif.results.directory import ResultDirectory
@@ -30,7 +29,7 @@ class Render(Settings):
     displacement; calibrate.toml with the settings of the former; truth/calibration.toml and truth/volume.nc.
     """
 
-    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    out: Path
     """Folder to write."""
     phantom: str = "flame"
     """Phantom: gaussians, flame, octahedron, turbulence, fire, gaussian-jet, plume, underexpanded, or 1 to 7 (numbers

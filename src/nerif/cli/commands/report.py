@@ -6,12 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-import tyro
-
 from nerif.cli.arguments import check_output
-from nerif.cli.commands.output import MONITOR
-from nerif.cli.commands.settings import Settings, command
+from nerif.cli.output import MONITOR
+from nerif.cli.settings import Settings, command
 from nerif.common.files import ending
+from nerif.common.settings import Positional
 from nerif.results.directory import REPORT
 from nerif.workflow.reports import write_report, write_sequence_report
 
@@ -22,9 +21,9 @@ __all__ = ["Report", "main", "run"]
 class Report(Settings):
     """Write the report of a result as one HTML file, which needs no network."""
 
-    result: Annotated[Path, tyro.conf.Positional]
+    result: Annotated[Path, Positional]
     """Result directory of nerif reconstruct, or store of nerif sequence (.zarr), complete or not."""
-    out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    out: Path | None = None
     """File to write (default: RESULT/report.html, or RESULT.html of a store; always overwritten)."""
     force: bool = False
     """Overwrite the file given by --out."""

@@ -6,20 +6,19 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
-import tyro
 from annotated_types import Ge
 
 from nerif.cli.commands import velocity
-from nerif.cli.commands.help import after_help
-from nerif.cli.commands.output import MONITOR, figures_bar
-from nerif.cli.commands.settings import Flat, Settings, read_settings, setting_of
+from nerif.cli.output import MONITOR, figures_bar
+from nerif.cli.settings import Settings, read_settings, setting_of
+from nerif.common.settings import MISSING, Flat, Positional
 from nerif.flow.assimilation import VelocityFit
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.neural.presets import PRESETS, preset
+from nerif.workflow.sequence import store
 from nerif.workflow.sequence.plan import SequenceSettings
 from nerif.workflow.sequence.reconstruct_sequence import reconstruct_sequence
 from nerif.workflow.sequence.run import Progress
-from nerif.workflow.sequence.store import DONE, MISSING, SequenceStore
 
 __all__ = ["Sequence", "main", "run"]
 
@@ -32,9 +31,9 @@ class Sequence(Settings):
     from the previous one.
     """
 
-    measurement: Annotated[Path, tyro.conf.Positional]
+    measurement: Annotated[Path, Positional]
     """Measurement sequence (.zarr) of nerif displacement --frames or nerif simulate --times."""
-    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    out: Path
     """Result (.zarr) to write or to continue."""
     cluster: str = "local"
     """Where to compute: local, tcp://HOST:PORT of a Dask scheduler, or a YAML file for SLURM (docs/sequences.md); not
@@ -59,7 +58,7 @@ class Sequence(Settings):
     """Its settings."""
 
 
-def run(settings: Sequence) -> SequenceStore:
+def run(settings: Sequence) -> store.SequenceStore:
     """Reconstruct the missing frames, and print a table of the result; then compute the velocity, if requested."""
     if settings.velocity is not None:
         velocity.check(settings.velocity, settings.out, settings.frames.quantities, settings.force)
@@ -73,7 +72,7 @@ def run(settings: Sequence) -> SequenceStore:
                 figures += f" | {progress.seconds_left:.0f} s left"
             bar(progress.settled / max(progress.total, 1), figures, progress.seconds)
 
-        store = reconstruct_sequence(
+        result = reconstruct_sequence(
             settings.out, settings.measurement, settings.reconstructor, settings.frames,
             cluster=settings.cluster, workers=settings.workers, threads=settings.threads,
             dashboard=settings.dashboard, retry=settings.retry, force=settings.force, on_progress=update,
@@ -81,15 +80,14 @@ def run(settings: Sequence) -> SequenceStore:
         )  # fmt: skip
     if settings.velocity is not None:
         velocity.run(velocity.Velocity(settings.out, settings.velocity, force=settings.force, fit=settings.flow))
-    return store
+    return result
 
 
 def main(arguments: list[str]) -> None:
     """Parse and run."""
     name = setting_of("preset", arguments, "auto")
     reconstructor = preset(name)
-    default = Sequence(tyro.MISSING, tyro.MISSING, preset=name, reconstructor=reconstructor)
-    arguments = after_help(arguments, default, "nerif sequence")
+    default = Sequence(MISSING, MISSING, preset=name, reconstructor=reconstructor)
     status = run(read_settings(default, arguments, "sequence")).status
-    if (status == MISSING).any() or not (status == DONE).any():
+    if (status == store.MISSING).any() or not (status == store.DONE).any():
         raise SystemExit(1)

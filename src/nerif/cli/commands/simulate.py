@@ -6,14 +6,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
-import tyro
-
 from nerif.cli.arguments import check_output
-from nerif.cli.commands.output import counting_bar, say
-from nerif.cli.commands.settings import Flat, Settings, command
+from nerif.cli.output import counting_bar, say
+from nerif.cli.settings import Settings, command
 from nerif.common.conventions import InputError, with_unit
 from nerif.common.interruption import if_interrupted
 from nerif.common.locks import locked
+from nerif.common.settings import Flat
 from nerif.data.volume import write_netcdf
 from nerif.geometry import Ring
 from nerif.simulation.simulate import Simulation
@@ -25,7 +24,7 @@ __all__ = ["Simulate", "main", "run"]
 class Simulate(Settings):
     """Trace rays through a phantom and write a measurement, with the true field as a volume."""
 
-    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    out: Path
     """Measurement to write, NAME.nc, with the true field NAME.truth.nc; .zarr instead of .nc with --times."""
     times: str = ""
     """Instants of a sequence of the flame, FIRST:LAST:COUNT in s, such as 0:2.3e-3:24."""

@@ -6,13 +6,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
-import tyro
-
 from nerif.analysis.velocity_verdict import MOST_MISFIT
 from nerif.cli.arguments import check_output
-from nerif.cli.commands.output import MONITOR, figures_bar
-from nerif.cli.commands.settings import Flat, Settings, command
+from nerif.cli.output import MONITOR, figures_bar
+from nerif.cli.settings import Settings, command
 from nerif.common.conventions import InputError
+from nerif.common.settings import Flat, Positional
 from nerif.data.velocity_sequence import VelocitySequence
 from nerif.data.volume import INDEX
 from nerif.flow.assimilation import FitIterate, VelocityFit
@@ -29,9 +28,9 @@ class Velocity(Settings):
     The same command continues an interrupted run.
     """
 
-    film: Annotated[Path, tyro.conf.Positional]
+    film: Annotated[Path, Positional]
     """Result of nerif sequence (.zarr), complete, or true fields over time."""
-    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    out: Path
     """Velocity (.zarr) to write; its report lies beside it."""
     frames: tuple[int, int] | None = None
     """First frame, and the one after the last (default: all)."""

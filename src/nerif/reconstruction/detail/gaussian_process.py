@@ -40,7 +40,7 @@ class GaussianProcess(SharedSettings):
     model: Literal[*MODEL_NAMES] = AUTO  # type: ignore[valid-type]
     """Linear forward model of displacements: lever_arm (auto) or paraxial."""
     source: Source = "auto"
-    """Data to fit (also --from): displacements, images (pixel by pixel, linearised about the displacements), both, or
+    """Data to fit: displacements, images (pixel by pixel, linearised about the displacements), both, or
     auto (displacements where available)."""
     hull: bool = True
     """Fix voxels outside the visual hull of the flow masks at the ambient index."""

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from annotated_types import Ge, Gt
 
 from nerif.common.conventions import InputError
-from nerif.common.settings import NonNegative, Positive
+from nerif.common.settings import Developer, NonNegative, Positive
 from nerif.fields.network import NetworkShape
 from nerif.forward.registry import AUTO, MODEL_NAMES
 from nerif.geometry.symmetry import NO_SYMMETRY
@@ -46,7 +46,7 @@ class TrainingSettings(SharedSettings):
     """Sample positions: adaptive (dense where the field varies), or in equal intervals: random (one draw per interval,
     paper), shifted (one draw per ray), regular (midpoints)."""
     source: Source = "auto"
-    """Data to fit (also --from): displacements, images (pixel by pixel, after a start from displacements or blurred
+    """Data to fit: displacements, images (pixel by pixel, after a start from displacements or blurred
     images), both, or auto (images where available)."""
     lens_rays: Annotated[int, Ge(0)] = 0
     """Rays per pixel through the aperture at the end, even; a third of them at the start (0: 2 to 12, by the width
@@ -59,13 +59,13 @@ class TrainingSettings(SharedSettings):
     """Maximum learning rate of Adam for a network of 4 x 128; scaled for other shapes (rates_by_shape)."""
     rates_by_shape: bool = True
     """Scale Adam's learning rates with the shape of the network, or use one for all weights (paper)."""
-    betas: tuple[float, float] = (0.9, 0.99)
+    betas: Annotated[tuple[float, float], Developer] = (0.9, 0.99)
     """Decay rates of Adam."""
-    matrix_rate: Positive = 2.0
+    matrix_rate: Annotated[Positive, Developer] = 2.0
     """Learning rate of Muon relative to Adam's."""
-    momentum: float = 0.9
+    momentum: Annotated[float, Developer] = 0.9
     """Momentum of Muon."""
-    warm_up: Annotated[int, Gt(0)] = 15
+    warm_up: Annotated[int, Gt(0), Developer] = 15
     """Steps over which the learning rate rises, at most a sixth of max_steps (cosine schedule)."""
     schedule: Literal["cosine", "constant"] = "cosine"
     """Learning rate over the run: cosine (falls to 1 %), or constant (paper)."""
@@ -74,21 +74,21 @@ class TrainingSettings(SharedSettings):
     on withheld rays stops falling."""
     max_steps: Annotated[int, Ge(0)] = 0
     """Limit in steps (0: none)."""
-    first_cycle: Annotated[int, Gt(0)] = 400
+    first_cycle: Annotated[int, Gt(0), Developer] = 400
     """Steps before the first convergence check of a run without a limit; doubled after each check."""
     stop_ratio: NonNegative = 0.0
     """Stop when the loss is below this share of the loss of the ambient field (0: never; paper: 0.005)."""
-    fit_steps: Annotated[int, Gt(0)] = 400
+    fit_steps: Annotated[int, Gt(0), Developer] = 400
     """Steps in which the network is fitted to the initial field (--start-from)."""
-    rate_after_fit: Positive = 0.3
+    rate_after_fit: Annotated[Positive, Developer] = 0.3
     """Share of the learning rate used after such a fit."""
     seed: int = 0
     """Random seed of weights and samples; CPU runs without a time limit are reproducible."""
     precision: Literal["auto", "float32", "tf32", "bf16"] = "auto"
     """Floating-point precision: float32, tf32, bf16 (mixed; the end of the run in float32), or auto."""
-    full_precision_from: float = 0.85
+    full_precision_from: Annotated[float, Developer] = 0.85
     """Share of the run after which bf16 changes to float32."""
-    compile: Literal["auto", "on", "off"] = "auto"
+    compile: Annotated[Literal["auto", "on", "off"], Developer] = "auto"
     """Compile the network: on, off, or auto (on CUDA by PyTorch; layers on a CPU in float32 by Numba)."""
 
     def __post_init__(self) -> None:

@@ -51,7 +51,7 @@ class VoxelReconstructor(SharedSettings):
     model: Literal[*MODEL_NAMES] = AUTO  # type: ignore[valid-type]
     """Linear forward model of displacements: lever_arm (auto) or paraxial."""
     source: Source = "auto"
-    """Data to fit (also --from): displacements, images (pixel by pixel, linearised about the displacements), both, or
+    """Data to fit: displacements, images (pixel by pixel, linearised about the displacements), both, or
     auto (displacements where available)."""
     step: float | None = None
     """Largest distance between sampling planes along a ray, in voxels (default: 1 for cubic, 0.5 for linear)."""

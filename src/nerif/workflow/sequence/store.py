@@ -19,6 +19,7 @@ import torch
 from nerif.common.conventions import InputError
 from nerif.common.files import atomic
 from nerif.common.netcdf import reading
+from nerif.common.settings import with_present_names
 from nerif.data.kinds import SEQUENCE_KIND, SEQUENCE_RESULT, check_kind
 from nerif.data.measurement_file import BODIES, bodies_of
 from nerif.data.measurement_sequence import MeasurementSequence, add_frames, check_store
@@ -206,6 +207,7 @@ class SequenceStore(VolumeSequence):
         for name, new in json.loads(json.dumps(attributes)).items():
             old = self.attributes.get(name)
             if isinstance(new, dict) and isinstance(old, dict):
+                old, new = with_present_names(old), with_present_names(new)
                 # a store of an earlier version lacks later settings, which are empty by default
                 key = next((k for k in new if new[k] != old.get(k) and (k in old or new[k])), None)
                 name, old, new = (name, None, None) if key is None else (key, old.get(key), new[key])
