@@ -11,9 +11,9 @@ from dataclasses import replace
 
 import pytest
 
-from nerif.cli import arguments
+from nerif.cli import arguments, output
 from nerif.cli.cli import COMMANDS, main
-from nerif.cli.commands import info, output, simulate
+from nerif.cli.commands import info, simulate
 from nerif.cli.output import MONITOR, counting_bar
 from nerif.common.files import atomic, written
 from nerif.common.interruption import Interrupted, if_interrupted

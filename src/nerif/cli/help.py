@@ -12,7 +12,6 @@ from nerif.common.settings import MISSING, Developer, Option, Positional, option
 __all__ = ["GROUPS", "help_text"]
 
 WIDTH, INDENT = 100, 26
-MANY = 60  # options, of which --help shows the frequent ones
 
 GROUPS: dict[str, tuple[str, ...]] = {
     "data": ("from", "withhold", "open_faces", "lower", "upper", "start_from"),
@@ -45,7 +44,7 @@ def help_text(record: Any, prog: str, everything: bool = False) -> str:
     lines = [f"usage: {' '.join([prog, *words])} [options]", ""]
     for paragraph in (inspect.getdoc(type(record)) or "").split("\n\n"):
         lines += [*textwrap.wrap(paragraph, WIDTH), ""]
-    if few := len(known) > MANY and not everything:
+    if few := record.brief and not everything:
         groups = {group: [known[name] for name in names if name in known] for group, names in GROUPS.items()}
     else:
         groups = {"arguments": places, "options": []}

@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self, TypeVar
+from typing import Any, ClassVar, Self, TypeVar
 
 from nerif.cli.arguments import flag_value, present_name, values_of
 from nerif.cli.help import help_text
@@ -26,6 +26,7 @@ a file, which may come from another person, cannot set them."""
 class Settings:
     """Settings of every command."""
 
+    brief: ClassVar[bool] = False  # help shows the frequent options; --help all shows the others
     config: Path | None = None
     """TOML file of settings, such as the run.toml of a result; options override it."""
 

@@ -9,7 +9,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import psutil
 
@@ -36,6 +36,7 @@ SCALAR_STEPS, SCALAR_SECONDS = 20, 5.0  # between TensorBoard scalars, whichever
 class Reconstruct(Settings):
     """Reconstruct the field of a measurement and write a result directory."""
 
+    brief: ClassVar[bool] = True
     measurement: Annotated[Path, Positional]
     """Measurement file (.nc); may be omitted with --resume."""
     out: Path

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from annotated_types import Ge
 
@@ -31,6 +31,7 @@ class Sequence(Settings):
     from the previous one.
     """
 
+    brief: ClassVar[bool] = True
     measurement: Annotated[Path, Positional]
     """Measurement sequence (.zarr) of nerif displacement --frames or nerif simulate --times."""
     out: Path
