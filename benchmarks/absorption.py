@@ -27,7 +27,7 @@ from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.reconstructor import Reconstructor
 from nerif.reconstruction.voxels.multiplicative import MLEM
 from nerif.reconstruction.voxels.total_variation import TotalVariation
-from nerif.simulation.simulate import Simulation
+from nerif.simulation.simulation import Simulation
 
 SVMBIR = "svmbir"
 COLUMNS = {

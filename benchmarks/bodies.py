@@ -32,8 +32,8 @@ from nerif.reconstruction.neural.presets import preset
 from nerif.reconstruction.reconstructor import Reconstructor
 from nerif.reconstruction.voxels.total_variation import TotalVariation
 from nerif.simulation.simulate import simulate
-from nerif.workflow.job import Run
 from nerif.workflow.pipeline import reconstruct_into
+from nerif.workflow.run_settings import Run
 
 APEX, ANGLE, STREAM, BEHIND, SURFACE = (-1.0, -0.8, -9.0), 31.33, 1.2e-4, 1.245, 1.433
 PIXEL = 0.4667  # mm

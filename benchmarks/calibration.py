@@ -22,7 +22,8 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.runner import Settings
 from nerif.geometry import Camera, Plane, Ring
-from nerif.imaging.calibration.calibrate import CalibrationSettings, calibrate
+from nerif.imaging.calibration.calibrate import calibrate
+from nerif.imaging.calibration.calibration_settings import CalibrationSettings
 from nerif.imaging.calibration.target_images import find_targets
 from nerif.imaging.readers.views import find_views
 from nerif.simulation.experiment import Experiment, background_scale, world_axes

@@ -28,8 +28,8 @@ from nerif.reconstruction.reconstructor import Reconstructor
 from nerif.reconstruction.voxels.total_variation import TotalVariation
 from nerif.results.directory import ResultDirectory
 from nerif.simulation.simulate import simulate
-from nerif.workflow.job import Run
 from nerif.workflow.pipeline import reconstruct_into
+from nerif.workflow.run_settings import Run
 
 COLUMNS = {
     "phantom": "{phantom}", "views": "{views}", "pixels": "{pixels}²", "method": "{method}", "detail": "{detail}",

@@ -21,11 +21,12 @@ import torch
 from benchmarks.runner import N_AMBIENT, Settings, peer, ratios
 from nerif.fields.phantoms import Scaled, make_phantom
 from nerif.geometry import paper_rig
-from nerif.imaging.displacement.displacement import DisplacementSettings
 from nerif.imaging.displacement.displacement import measure as measure_displacement
 from nerif.imaging.displacement.optical_flow import FLOWS
+from nerif.imaging.imaging_settings import DisplacementSettings
 from nerif.imaging.patterns import KINDS, Background
-from nerif.simulation.rendering import Sensor, background_texture, pattern_size, render
+from nerif.simulation.experiment_settings import Sensor
+from nerif.simulation.rendering import background_texture, pattern_size, render
 from nerif.simulation.simulate import view_displacement
 
 COLUMNS = {

@@ -24,14 +24,15 @@ from nerif.data.volume_file import read_volume
 from nerif.fields.field import Field
 from nerif.fields.phantoms import Scaled, make_phantom
 from nerif.geometry import Grid, Lens, paper_rig
-from nerif.imaging.displacement.displacement import DisplacementSettings
 from nerif.imaging.displacement.displacement import measure as measure_displacement
+from nerif.imaging.imaging_settings import DisplacementSettings, Surroundings
 from nerif.imaging.patterns import Background
-from nerif.imaging.recording import Scene, Surroundings, ViewMeasurement, join_views
+from nerif.imaging.recording import Scene, ViewMeasurement, join_views
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.shared_settings import Source
 from nerif.reconstruction.voxels.total_variation import TotalVariation
-from nerif.simulation.rendering import Sensor, background_texture, pattern_size, render
+from nerif.simulation.experiment_settings import Sensor
+from nerif.simulation.rendering import background_texture, pattern_size, render
 
 REFERENCES = 5
 CHECKER = "checker"

@@ -26,7 +26,7 @@ from nerif.data.measurement_sequence import MeasurementSequence
 from nerif.data.volume_sequence import VolumeSequence
 from nerif.geometry import Ring
 from nerif.reconstruction.neural.presets import preset as settings_of
-from nerif.simulation.simulate import Simulation
+from nerif.simulation.simulation import Simulation
 from nerif.workflow.sequence.chunk import reconstruct_frames
 from nerif.workflow.sequence.plan import SequencePlan, SequenceSettings
 from nerif.workflow.sequence.store import DONE, Frame, SequenceStore

@@ -20,17 +20,18 @@ import torch
 from scipy.optimize import least_squares
 
 from nerif.data.measurement import Measurement
-from nerif.imaging.calibration.importers.importers import ImportSettings
-from nerif.imaging.calibration.simple_rig import SimpleRig, box_about_axis, find_image, simple_camera
+from nerif.imaging.calibration.calibration_settings import ImportSettings, SimpleRig
+from nerif.imaging.calibration.simple_rig import box_about_axis, find_image, simple_camera
+from nerif.imaging.imaging_settings import Surroundings
 from nerif.imaging.readers.views import find_views
-from nerif.imaging.recording import Recording, Scene, Surroundings, measure_instant
+from nerif.imaging.recording import Recording, Scene, measure_instant
 from nerif.plotting.drawing import style
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.progress import Monitor
 from nerif.report.meridian_figure import draw_centre_line, draw_section
 from nerif.results.directory import ResultDirectory
-from nerif.workflow.job import Run
 from nerif.workflow.pipeline import reconstruct_into
+from nerif.workflow.run_settings import Run
 
 HARMONICS = 3  # of a cell
 DRAWS = 200  # of the bootstrap

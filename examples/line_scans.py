@@ -25,7 +25,7 @@ from jaxtyping import Float, Int
 from nerif import Box, Camera, InputError, Measurement
 from nerif.data.measurement import measurement_of
 from nerif.forward.absorption import Absorption
-from nerif.geometry.camera import TELECENTRIC
+from nerif.geometry.projection import TELECENTRIC
 
 END_READINGS = 3  # at either end of an angle, outside the medium
 EMPTY = 0.02  # of the largest reading, below which an end is outside the medium

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from nerif.cli.cli import main
 from nerif.data.measurement_sequence import MeasurementSequence
-from nerif.fields.network import NetworkShape
+from nerif.fields.network_shape import NetworkShape
 from nerif.reconstruction.neural.neural import NeRIF
 
 RIG = ["--image-size", "14", "16", "--pixel-pitch", "0.3", "--views", "3", "--steps", "20", "--truth-voxels", "12"]

@@ -11,8 +11,8 @@ from nerif import __version__
 from nerif.forward.deflection import MODELS
 from nerif.geometry import Box, Ring
 from nerif.reconstruction.device import resolve_device
-from nerif.reconstruction.neural.losses import LossWeights
 from nerif.reconstruction.neural.presets import PRESETS, preset
+from nerif.reconstruction.neural.training_settings import LossWeights
 from nerif.reconstruction.reconstructor import Reconstructor
 from nerif.reconstruction.voxels.landweber import Landweber
 from nerif.reconstruction.voxels.tikhonov import Tikhonov

@@ -47,7 +47,8 @@ for ax, kind in zip(axes, ("target", "reference", "flow"), strict=True):
 # Intrinsics, distortion and poses of all cameras, and the plane of each background, by bundle adjustment. The target
 # pose ``0`` defines the world frame. The same on the command line: ``nerif calibrate experiment -o
 # calibration.toml``.
-from nerif.imaging.calibration.calibrate import CalibrationSettings, calibrate_views
+from nerif.imaging.calibration.calibrate import calibrate_views
+from nerif.imaging.calibration.calibration_settings import CalibrationSettings
 from nerif.imaging.readers.views import find_views
 from nerif.simulation.experiment import background_scale, world_axes
 
@@ -66,7 +67,8 @@ for i, name in enumerate(calibration.names):
 # The shift of the pattern between reference and flow, by window correlation, and its noise from the reference images.
 # ``nerif displacement experiment --calibration calibration.toml -o m.nc``.
 from nerif.data.cameras_file import read_cameras
-from nerif.imaging.recording import Recording, Scene, Surroundings, measure_instant
+from nerif.imaging.imaging_settings import Surroundings
+from nerif.imaging.recording import Recording, Scene, measure_instant
 
 calibration.write(folder / "calibration.toml", box)
 cameras = {camera.name: camera for camera in read_cameras(folder / "calibration.toml")}

@@ -37,12 +37,8 @@ _ = right.set(title="flow minus reference", xticks=[], yticks=[])
 # ----------
 # Its distance from the jet, the distance of the background, and the scale of the image, with a ruler. They are
 # guesses here, so lengths are correct up to one factor and the index up to another.
-from nerif.imaging.calibration.importers.importers import ImportSettings
-from nerif.imaging.calibration.simple_rig import (
-    SimpleRig,
-    box_about_axis,
-    simple_camera,
-)
+from nerif.imaging.calibration.calibration_settings import ImportSettings, SimpleRig
+from nerif.imaging.calibration.simple_rig import box_about_axis, simple_camera
 
 rig = SimpleRig(distance=1000, mm_per_px=0.1)
 settings = ImportSettings(background_distance=300)
@@ -51,8 +47,9 @@ camera = simple_camera(rig, images["flow"].shape, settings, "camera")
 # %%
 # Displacements
 # -------------
+from nerif.imaging.imaging_settings import Surroundings
 from nerif.imaging.readers.views import find_views
-from nerif.imaging.recording import Recording, Scene, Surroundings, measure_instant
+from nerif.imaging.recording import Recording, Scene, measure_instant
 
 scene = Scene(box_about_axis(camera), Surroundings())
 recording = Recording(find_views(folder), {"camera": camera}, scene, images=False)

@@ -35,12 +35,12 @@ from .reconstruction.voxels.tikhonov import Tikhonov as Tikhonov
 from .reconstruction.voxels.total_variation import TotalVariation as TotalVariation
 from .results.directory import ResultDirectory as ResultDirectory
 from .results.read import read as read
-from .simulation.simulate import Simulation as Simulation
 from .simulation.simulate import add_noise as add_noise
 from .simulation.simulate import simulate as simulate
-from .workflow.job import Run as Run
+from .simulation.simulation import Simulation as Simulation
 from .workflow.pipeline import reconstruct_into as reconstruct_into
 from .workflow.reports import write_report as write_report
+from .workflow.run_settings import Run as Run
 from .workflow.sequence.plan import SequenceSettings as SequenceSettings
 from .workflow.sequence.reconstruct_sequence import reconstruct_sequence as reconstruct_sequence
 

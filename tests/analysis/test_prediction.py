@@ -13,8 +13,9 @@ from nerif.analysis import prediction
 from nerif.analysis.prediction import SampledViews, on_voxels, reproject
 from nerif.data.measurement import Measurement
 from nerif.data.reprojection import Accuracy, Reprojection
-from nerif.fields.network import Network, NetworkShape, NeuralField
+from nerif.fields.network import Network, NeuralField
 from nerif.fields.network_kinds import network_in
+from nerif.fields.network_shape import NetworkShape
 from nerif.fields.phantoms import GaussianBalls
 from nerif.forward.deflection import MODELS, Deflection
 from nerif.forward.path_integral import PathIntegral

@@ -19,8 +19,8 @@ from nerif.report.summary import headline
 from nerif.results.directory import Gap, Result, ResultDirectory
 from nerif.results.metrics_file import Metrics
 from nerif.simulation.simulate import simulate
-from nerif.workflow.job import Run
 from nerif.workflow.pipeline import reconstruct_into
+from nerif.workflow.run_settings import Run
 
 WHITE = {"grain": 1.0, "white": True, "cause": "", "share": 0.0, "row": 4.0, "column": 4.0, "correlated": 0.0}
 CORRELATED = {"grain": 3.0, "white": False, "correlated": 0.36}

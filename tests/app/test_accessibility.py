@@ -22,7 +22,7 @@ from nerif.app.pages import PAGES
 from nerif.app.pages.frame import Page
 from nerif.data.cameras_file import CalibratedCamera, write_cameras
 from nerif.geometry import Ring
-from nerif.simulation.simulate import Simulation
+from nerif.simulation.simulation import Simulation
 from report.browsing import errors, needs_browser, requests, wait_for
 
 pytestmark = needs_browser

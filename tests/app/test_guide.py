@@ -33,7 +33,7 @@ from nerif.data.cameras_file import CalibratedCamera, write_cameras
 from nerif.geometry import Ring
 from nerif.geometry.camera import Camera
 from nerif.results.directory import ResultDirectory
-from nerif.simulation.simulate import Simulation
+from nerif.simulation.simulation import Simulation
 from refusals import refused
 from report.browsing import errors, needs_browser, text, wait_for
 

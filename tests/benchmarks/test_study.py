@@ -18,7 +18,7 @@ from benchmarks.study.results import Results
 from benchmarks.study.running import run_case
 from nerif.common.conventions import InputError
 from nerif.fields.field import Field
-from nerif.fields.network import NetworkShape
+from nerif.fields.network_shape import NetworkShape
 from nerif.geometry import Ring
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.reconstructor import Outcome, Reconstruction

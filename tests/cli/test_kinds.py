@@ -27,7 +27,7 @@ from nerif.data.velocity_sequence import VelocitySequence
 from nerif.data.volume import Volume, export
 from nerif.data.volume_file import read_volume
 from nerif.data.volume_sequence import VolumeSequence
-from nerif.fields.network import NetworkShape
+from nerif.fields.network_shape import NetworkShape
 from nerif.geometry import Grid
 from nerif.imaging.readers.views import find_views
 from nerif.reconstruction.field_files import CHECKPOINT

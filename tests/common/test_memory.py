@@ -26,7 +26,7 @@ from nerif.data.volume import Volume, write_netcdf
 from nerif.data.volume_file import read_volume
 from nerif.data.volume_sequence import VolumeSequence
 from nerif.data.vti import read_vti, write_vti
-from nerif.fields.network import NetworkShape
+from nerif.fields.network_shape import NetworkShape
 from nerif.geometry import Box, Grid
 from nerif.imaging.calibration.importers.importers import import_cameras
 from nerif.imaging.readers.open import open_frames

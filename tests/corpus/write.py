@@ -20,7 +20,7 @@ from nerif.app.project.folder import OWN, ProjectFolder
 from nerif.app.project.workspace import Workspace
 from nerif.cli.cli import main
 from nerif.data.cameras_file import CalibratedCamera, write_cameras
-from nerif.fields.network import NetworkShape
+from nerif.fields.network_shape import NetworkShape
 from nerif.geometry import Box, Grid, Ring
 from nerif.reconstruction.field_files import CHECKPOINT
 

@@ -13,13 +13,12 @@ from safetensors.torch import load_file, save_file
 from nerif.fields.network import (
     ACTIVATIONS,
     Network,
-    NetworkShape,
     NeuralField,
     encode,
     encode_pullback,
-    encoded_width,
     wave_vectors,
 )  # fmt: skip
+from nerif.fields.network_shape import NetworkShape, encoded_width
 from nerif.geometry import Box
 from nerif.reconstruction.field_files import FIELD, read_field, write_field
 from nerif.reconstruction.neural.presets import PRESETS

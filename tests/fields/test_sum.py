@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from nerif.analysis.prediction import predict, reproject
-from nerif.fields.network import Network, NetworkShape, NeuralField
+from nerif.fields.network import Network, NeuralField
+from nerif.fields.network_shape import NetworkShape
 from nerif.fields.phantoms import make_phantom
 from nerif.fields.sum import SumField
 from nerif.fields.symmetric import symmetry_of_field

@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from nerif.fields.network import NetworkShape, NeuralField
+from nerif.fields.network import NeuralField
+from nerif.fields.network_shape import NetworkShape
 from nerif.fields.symmetric import SymmetricNetwork, SymmetricVoxels
 from nerif.fields.voxel_field import Boundary, VoxelField
 from nerif.geometry import Box, Grid

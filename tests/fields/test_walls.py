@@ -9,8 +9,9 @@ import torch
 
 from bodies import ball, cuboid
 from nerif.fields.field import Field
-from nerif.fields.network import NetworkShape, NeuralField
+from nerif.fields.network import NeuralField
 from nerif.fields.network_kinds import network_in
+from nerif.fields.network_shape import NetworkShape
 from nerif.fields.walls import WallNetwork
 from nerif.geometry import Box, Grid, Ring
 from nerif.geometry.body import contained, from_surface

@@ -18,7 +18,7 @@ from nerif.analysis.prediction import predict, reproject
 from nerif.cli.cli import main
 from nerif.data.measurement import Measurement
 from nerif.data.volume import Volume
-from nerif.fields.network import NetworkShape
+from nerif.fields.network_shape import NetworkShape
 from nerif.fields.phantoms import GaussianBalls
 from nerif.fields.voxel_field import VoxelField
 from nerif.forward.deflection import LeverArm

@@ -17,7 +17,8 @@ from nerif.analysis.gains import fit_gains, with_gains
 from nerif.analysis.prediction import predict, reproject
 from nerif.data.measurement import Measurement, measurement_of
 from nerif.fields.field import Field
-from nerif.fields.network import Network, NetworkShape, NeuralField
+from nerif.fields.network import Network, NeuralField
+from nerif.fields.network_shape import NetworkShape
 from nerif.fields.phantoms import GaussianBalls, Scaled
 from nerif.forward import registry
 from nerif.forward.absorption import Absorption, absorbance
@@ -30,10 +31,11 @@ from nerif.forward.path_integral import PathIntegral
 from nerif.forward.registry import TECHNIQUES, forward_model, forward_models
 from nerif.geometry import Grid, Lens, Rays
 from nerif.reconstruction.field_files import read_state, write_state
-from nerif.reconstruction.neural.losses import LossWeights, loss_terms
+from nerif.reconstruction.neural.losses import loss_terms
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.neural.trainer import Trainer
 from nerif.reconstruction.neural.training_data import TrainingData
+from nerif.reconstruction.neural.training_settings import LossWeights
 from nerif.reconstruction.reconstructor import Reconstructor, State
 from nerif.reconstruction.target import Target
 from nerif.reconstruction.voxels.multiplicative import MART, MLEM
@@ -41,7 +43,8 @@ from nerif.reconstruction.voxels.operator import VoxelOperator
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.reconstruction.voxels.total_variation import TotalVariation
 from nerif.reconstruction.voxels.voxel_problem import Problem
-from nerif.simulation.simulate import Simulation, simulate
+from nerif.simulation.simulate import simulate
+from nerif.simulation.simulation import Simulation
 from refusals import refused
 from techniques import BOX, RING, Cubic, Knife
 

@@ -22,9 +22,10 @@ from nerif.forward.emission import Emission
 from nerif.geometry import Box, Ring
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.results.directory import REPROJECTION, ResultDirectory
-from nerif.simulation.simulate import Simulation, simulate
-from nerif.workflow.job import Run
+from nerif.simulation.simulate import simulate
+from nerif.simulation.simulation import Simulation
 from nerif.workflow.pipeline import reconstruct_into
+from nerif.workflow.run_settings import Run
 from refusals import refused
 
 RING = Ring(views=4, image_size=(14, 17), pixel_pitch=0.26)

@@ -15,7 +15,8 @@ from nerif.analysis.consistency import everywhere, image_remarks, of_one_view
 from nerif.analysis.evaluation import score_lines
 from nerif.cli.cli import main
 from nerif.data.measurement import Measurement
-from nerif.data.volume import INDEX, Volume, field_of, write_netcdf
+from nerif.data.quantity_names import INDEX, field_of
+from nerif.data.volume import Volume, write_netcdf
 from nerif.data.volume_file import read_volume
 from nerif.forward.absorption import Absorption
 from nerif.geometry import Box, Grid

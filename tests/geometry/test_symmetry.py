@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from nerif.geometry import Box
-from nerif.geometry.symmetry import Symmetry, parse_symmetry
+from nerif.geometry.symmetry import Symmetry
+from nerif.geometry.symmetry_names import parse_symmetry
 from refusals import refused
 
 BOX = Box((-20.0, -20.0, -30.0), (20.0, 20.0, 30.0))

@@ -27,8 +27,8 @@ from nerif.reconstruction.neural.presets import preset
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.results.directory import ResultDirectory
 from nerif.simulation.simulate import simulate
-from nerif.workflow.job import Run
 from nerif.workflow.pipeline import reconstruct_into
+from nerif.workflow.run_settings import Run
 from refusals import refused
 
 CONE = Path(__file__).parents[3] / "shared" / "data" / "body"

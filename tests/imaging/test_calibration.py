@@ -16,7 +16,8 @@ from nerif.common.files import read_toml
 from nerif.data.cameras_file import read_cameras
 from nerif.geometry import PROJECTIONS, TELECENTRIC, Camera, Plane, Ring
 from nerif.imaging.calibration.bundle import INTRINSIC, CameraBundle, Pose, TargetObservation, _ParameterOrder, adjust
-from nerif.imaging.calibration.calibrate import CalibrationSettings, _on_side, calibrate
+from nerif.imaging.calibration.calibrate import _on_side, calibrate
+from nerif.imaging.calibration.calibration_settings import CalibrationSettings
 from nerif.imaging.calibration.first_guess import first_guess, mirror
 from nerif.imaging.calibration.result import Calibration
 from nerif.imaging.calibration.targets import CalibrationTarget, Detection, TargetDetections

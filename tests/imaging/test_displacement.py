@@ -9,9 +9,10 @@ import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from nerif.imaging.displacement.correlation import normalised_median_outliers, window_correlation
-from nerif.imaging.displacement.displacement import UNEVEN, DisplacementSettings, displacement, measure
+from nerif.imaging.displacement.displacement import UNEVEN, displacement, measure
 from nerif.imaging.displacement.optical_flow import FLOWS
 from nerif.imaging.displacement.warping import warp
+from nerif.imaging.imaging_settings import DisplacementSettings
 from nerif.imaging.patterns import Background
 from nerif.imaging.shake import border, remove_shake
 from refusals import refused

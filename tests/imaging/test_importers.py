@@ -23,7 +23,8 @@ from nerif.cli.commands.displacement import Displacement
 from nerif.common.conventions import InputError
 from nerif.data.cameras_file import CalibratedCamera, read_box, read_cameras, write_cameras
 from nerif.geometry import TELECENTRIC, Box, Camera, Lens, Plane
-from nerif.imaging.calibration.importers.importers import ImportSettings, import_cameras, is_calibration
+from nerif.imaging.calibration.calibration_settings import ImportSettings
+from nerif.imaging.calibration.importers.importers import import_cameras, is_calibration
 from refusals import refused
 
 PLANE = Plane(torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64), -900.0)

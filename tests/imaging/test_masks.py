@@ -15,15 +15,8 @@ from nerif.data.measurement import Measurement
 from nerif.fields.phantoms import Scaled, make_phantom
 from nerif.forward.emission import Emission
 from nerif.geometry import Box, Grid, Ring
-from nerif.imaging.masks import (
-    MaskSettings,
-    MaskShape,
-    drawn_masks,
-    flow_mask,
-    mask_of,
-    with_flow_masks,
-    write_masks,
-)
+from nerif.imaging.imaging_settings import MaskSettings
+from nerif.imaging.masks import MaskShape, drawn_masks, flow_mask, mask_of, with_flow_masks, write_masks
 from nerif.imaging.readers.open import read_mask
 from nerif.reconstruction.gauge import visual_hull
 from nerif.simulation.simulate import simulate

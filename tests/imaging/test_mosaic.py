@@ -19,7 +19,8 @@ from nerif.imaging.calibration.bundle import Pose
 from nerif.imaging.calibration.simple_rig import find_image
 from nerif.imaging.calibration.target_images import find_targets
 from nerif.imaging.calibration.targets import CalibrationTarget
-from nerif.imaging.displacement.displacement import DisplacementSettings, Reference
+from nerif.imaging.displacement.displacement import Reference
+from nerif.imaging.imaging_settings import DisplacementSettings
 from nerif.imaging.quality.image_quality import image_quality
 from nerif.imaging.readers.binning import Binning
 from nerif.imaging.readers.crop import Crop
@@ -29,7 +30,8 @@ from nerif.imaging.readers.open import open_frames, read_mask
 from nerif.imaging.readers.views import View, find_views, good_images
 from nerif.imaging.recording import camera_of
 from nerif.simulation.experiment import place
-from nerif.simulation.rendering import Sensor, render
+from nerif.simulation.experiment_settings import Sensor
+from nerif.simulation.rendering import render
 from refusals import refused
 
 H, W = 128, 160

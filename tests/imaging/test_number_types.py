@@ -10,17 +10,11 @@ from scipy.ndimage import gaussian_filter
 
 from nerif.imaging.calibration.targets import eight_bit, saddle_points
 from nerif.imaging.displacement.correlation import correlate, normalised_median_outliers
-from nerif.imaging.displacement.displacement import (
-    DisplacementSettings,
-    Reference,
-    border,
-    displacement,
-    measure,
-    remove_shake,
-)
+from nerif.imaging.displacement.displacement import Reference, border, displacement, measure, remove_shake
 from nerif.imaging.displacement.photometry import CameraNoise, ImagePair
 from nerif.imaging.displacement.warping import warp
-from nerif.imaging.masks import MaskSettings, flow_mask
+from nerif.imaging.imaging_settings import DisplacementSettings, MaskSettings
+from nerif.imaging.masks import flow_mask
 from nerif.imaging.noise import local_correlation, smoothing_error, structure_variance
 from nerif.imaging.quality.image_quality import shrink
 from nerif.imaging.readers.exposure import check_exposure, saturated

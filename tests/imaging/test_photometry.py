@@ -8,9 +8,10 @@ import torch
 from scipy.ndimage import gaussian_filter
 
 from nerif.forward.images import Images
-from nerif.imaging.displacement.displacement import DisplacementSettings, Reference, measure
+from nerif.imaging.displacement.displacement import Reference, measure
 from nerif.imaging.displacement.photometry import CameraNoise, ImagePair
 from nerif.imaging.displacement.warping import warp
+from nerif.imaging.imaging_settings import DisplacementSettings
 
 SHAPE = (90, 100)
 READ, ELECTRONS = 6.0, 3.0  # grey values; electrons per grey value

@@ -21,8 +21,7 @@ from nerif.data.cameras_file import CalibratedCamera
 from nerif.data.measurement import Measurement
 from nerif.geometry import Box, Lens, Plane, Ring
 from nerif.imaging import workers
-from nerif.imaging.displacement.displacement import DisplacementSettings
-from nerif.imaging.masks import MaskSettings
+from nerif.imaging.imaging_settings import DisplacementSettings, MaskSettings
 from nerif.imaging.readers.crop import Crop
 from nerif.imaging.readers.views import View, find_views, paired
 from nerif.imaging.recording import Recording, Scene, ViewReference, camera_of, measure_instant

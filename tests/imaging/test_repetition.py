@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from nerif.imaging.displacement.displacement import DisplacementSettings, measure
+from nerif.imaging.displacement.displacement import measure
+from nerif.imaging.imaging_settings import DisplacementSettings
 from nerif.imaging.patterns import KINDS, Background
 from nerif.imaging.quality.repetition import repetition
 

@@ -15,8 +15,9 @@ from nerif.common.conventions import InputError
 from nerif.data.cameras_file import read_box, read_cameras, write_cameras
 from nerif.data.measurement import Measurement
 from nerif.geometry import Box, Lens
-from nerif.imaging.calibration.importers.importers import ImportSettings, import_box
-from nerif.imaging.calibration.simple_rig import SimpleRig, box_about_axis, find_image, simple_camera
+from nerif.imaging.calibration.calibration_settings import ImportSettings, SimpleRig
+from nerif.imaging.calibration.importers.importers import import_box
+from nerif.imaging.calibration.simple_rig import box_about_axis, find_image, simple_camera
 from refusals import refused
 
 SIZE = (320, 240)

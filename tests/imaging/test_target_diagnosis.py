@@ -11,7 +11,8 @@ import pytest
 import tifffile
 from scipy.spatial.transform import Rotation
 
-from nerif.imaging.calibration.calibrate import CalibrationSettings, calibrate_views
+from nerif.imaging.calibration.calibrate import calibrate_views
+from nerif.imaging.calibration.calibration_settings import CalibrationSettings
 from nerif.imaging.calibration.target_diagnosis import explain, identify
 from nerif.imaging.calibration.target_images import find_targets
 from nerif.imaging.calibration.targets import CalibrationTarget

@@ -11,7 +11,8 @@ from nerif.geometry import Camera, Plane
 from nerif.imaging.calibration.bundle import Pose
 from nerif.imaging.calibration.targets import CalibrationTarget
 from nerif.simulation.experiment import place
-from nerif.simulation.rendering import Sensor, render
+from nerif.simulation.experiment_settings import Sensor
+from nerif.simulation.rendering import render
 from refusals import refused
 
 TARGETS = {

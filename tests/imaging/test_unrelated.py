@@ -11,7 +11,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 
 from nerif.data.cameras_file import CalibratedCamera
 from nerif.geometry import Box, Ring
-from nerif.imaging.displacement.displacement import DisplacementSettings
+from nerif.imaging.imaging_settings import DisplacementSettings
 from nerif.imaging.readers.views import find_views
 from nerif.imaging.recording import Recording, Scene, ViewReference, measure_instant
 from nerif.imaging.recording_sequence import measure_recording

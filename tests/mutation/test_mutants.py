@@ -23,7 +23,7 @@ from nerif.data.measurement import Measurement
 from nerif.data.measurement_sequence import MeasurementSequence
 from nerif.data.volume import Volume, export, write_netcdf
 from nerif.data.volume_file import read_volume
-from nerif.fields.network import NetworkShape
+from nerif.fields.network_shape import NetworkShape
 from nerif.fields.phantoms import GaussianBalls
 from nerif.fields.voxel_field import VoxelField
 from nerif.geometry import Box, Camera, Grid, Ring

@@ -16,7 +16,8 @@ from nerif.fields.voxel_field import VoxelField
 from nerif.geometry import Grid
 from nerif.reconstruction.reconstructor import Outcome, Reconstruction
 from nerif.results.directory import ResultDirectory
-from nerif.simulation.simulate import Simulation, simulate
+from nerif.simulation.simulate import simulate
+from nerif.simulation.simulation import Simulation
 
 N_AMBIENT = 1.00027
 
@@ -77,7 +78,8 @@ def test_frames_are_compared_with_truths_over_another_ambient(measurement, tmp_p
     pytest.importorskip("zarr", reason="pip install '.[sequence]'")
     from nerif.data.measurement_sequence import MeasurementSequence
     from nerif.data.volume_sequence import VolumeSequence
-    from nerif.fields.network import Network, NetworkShape, NeuralField
+    from nerif.fields.network import Network, NeuralField
+    from nerif.fields.network_shape import NetworkShape
     from nerif.workflow.sequence.sequence_evaluation import evaluate_sequence
     from nerif.workflow.sequence.store import Frame, SequenceStore
 

@@ -13,19 +13,20 @@ from nerif.analysis.evaluation import evaluate_views
 from nerif.analysis.prediction import predict_view, reproject
 from nerif.cli.cli import main
 from nerif.data.measurement import Measurement
-from nerif.fields.network import NetworkShape
+from nerif.fields.network_shape import NetworkShape
 from nerif.fields.phantoms import make_phantom
 from nerif.forward.images import Images
 from nerif.forward.path_integral import PathIntegral
 from nerif.forward.registry import forward_model
 from nerif.geometry import Box, Grid, Lens, Ring
 from nerif.reconstruction.aperture import apply_aperture, lens_rays
-from nerif.reconstruction.neural.losses import LossWeights, MixedPrecision
+from nerif.reconstruction.neural.losses import MixedPrecision
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.neural.objective import Objective
 from nerif.reconstruction.neural.parallel import Ranks
 from nerif.reconstruction.neural.sampling import PixelSampling, Sampler
 from nerif.reconstruction.neural.training_data import TrainingData
+from nerif.reconstruction.neural.training_settings import LossWeights
 from nerif.reconstruction.voxels.operator import VoxelOperator, rays_through
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.results.directory import ResultDirectory

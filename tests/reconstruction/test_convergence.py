@@ -11,7 +11,7 @@ import torch
 
 from nerif.analysis.evaluation import evaluate_volume
 from nerif.data.volume import Volume
-from nerif.fields.network import NetworkShape
+from nerif.fields.network_shape import NetworkShape
 from nerif.geometry import Grid
 from nerif.reconstruction.field_files import read_state, write_state
 from nerif.reconstruction.neural import objective, schedule

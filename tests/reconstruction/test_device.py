@@ -14,7 +14,8 @@ from nerif.analysis.consistency import check_consistency
 from nerif.analysis.prediction import predict, reproject
 from nerif.analysis.rig_check import check_rig
 from nerif.common.pauses import at_pauses, pause
-from nerif.fields.network import Network, NetworkShape
+from nerif.fields.network import Network
+from nerif.fields.network_shape import NetworkShape
 from nerif.fields.phantoms import make_phantom
 from nerif.fields.voxel_field import VoxelField
 from nerif.geometry import Box, Grid, Ring

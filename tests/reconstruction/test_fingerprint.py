@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from nerif.data.measurement import Measurement
-from nerif.fields.network import NetworkShape
+from nerif.fields.network_shape import NetworkShape
 from nerif.forward.registry import technique
 from nerif.geometry import Box
 from nerif.reconstruction.field_files import fingerprint

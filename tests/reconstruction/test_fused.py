@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from nerif.fields.network import UNBOUNDED, Network, NetworkShape
+from nerif.fields.network import UNBOUNDED, Network
+from nerif.fields.network_shape import NetworkShape
 from nerif.reconstruction.neural import fused
 from nerif.reconstruction.neural.losses import MixedPrecision
 

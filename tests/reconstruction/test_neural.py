@@ -14,7 +14,8 @@ import torch
 from nerif.analysis.evaluation import evaluate_views, evaluate_volume, reproject
 from nerif.data.measurement import Measurement
 from nerif.data.volume import Volume
-from nerif.fields.network import Network, NetworkShape
+from nerif.fields.network import Network
+from nerif.fields.network_shape import NetworkShape
 from nerif.fields.phantoms import make_phantom
 from nerif.forward.forward_model import Weights
 from nerif.geometry import Grid, paper_rig
@@ -22,10 +23,11 @@ from nerif.reconstruction import bins
 from nerif.reconstruction.field_files import read_state, write_state
 from nerif.reconstruction.gauge import Gauge
 from nerif.reconstruction.neural import objective, trainer, watch
-from nerif.reconstruction.neural.losses import LossWeights, MixedPrecision, by_differences
+from nerif.reconstruction.neural.losses import MixedPrecision, by_differences
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.neural.presets import PRESETS, preset
 from nerif.reconstruction.neural.training_data import TrainingData
+from nerif.reconstruction.neural.training_settings import LossWeights
 from nerif.reconstruction.reconstructor import Reconstruction, Step
 from nerif.reconstruction.target import Target
 from nerif.simulation.simulate import simulate
@@ -304,7 +306,8 @@ def test_bf16_changes_to_float32_at_the_end(measurement, undisturbed):
 
 COMPILED = """
 import torch
-from nerif.fields.network import Network, NetworkShape
+from nerif.fields.network import Network
+from nerif.fields.network_shape import NetworkShape
 torch.manual_seed(0)
 net = Network(NetworkShape(depth=3, width=32, octaves=2, skip=2, head_width=8, gradient_head=True))
 fast = torch.compile(net.value_and_gradient, dynamic=True)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from nerif.fields.network import Network, NetworkShape
+from nerif.fields.network import Network
+from nerif.fields.network_shape import NetworkShape
 from nerif.reconstruction.neural.optimiser import REFERENCE, NetworkOptimiser
 from refusals import refused
 

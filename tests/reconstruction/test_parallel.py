@@ -13,14 +13,15 @@ import torch
 
 from nerif.cli.cli import main
 from nerif.data.measurement import Measurement
-from nerif.fields.network import NetworkShape
+from nerif.fields.network_shape import NetworkShape
 from nerif.reconstruction.field_files import read_field
-from nerif.reconstruction.neural.losses import LossWeights, MixedPrecision
+from nerif.reconstruction.neural.losses import MixedPrecision
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.neural.objective import Objective
 from nerif.reconstruction.neural.parallel import Ranks
 from nerif.reconstruction.neural.sampling import PixelSampling, Sampler
 from nerif.reconstruction.neural.training_data import TrainingData
+from nerif.reconstruction.neural.training_settings import LossWeights
 
 SMALL = [
     "--network.depth", "2", "--network.width", "24", "--network.octaves", "2", "--max-steps", "30",

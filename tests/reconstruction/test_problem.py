@@ -15,10 +15,11 @@ from nerif.fields.voxel_field import Boundary
 from nerif.geometry import Box, Grid
 from nerif.reconstruction.target import Target
 from nerif.reconstruction.voxels import voxel_problem as problem_module
+from nerif.reconstruction.voxels.face_gradients import at_faces, gradient_square
 from nerif.reconstruction.voxels.landweber import Landweber
 from nerif.reconstruction.voxels.operator import VoxelOperator
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
-from nerif.reconstruction.voxels.total_variation import TotalVariation, at_faces, gradient_square
+from nerif.reconstruction.voxels.total_variation import TotalVariation
 from nerif.reconstruction.voxels.voxel_problem import (
     Differences,
     Penalty,

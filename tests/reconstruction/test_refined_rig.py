@@ -28,8 +28,8 @@ from nerif.reconstruction.voxels.total_variation import TotalVariation
 from nerif.report.figures import draw_corrections
 from nerif.results.directory import ResultDirectory
 from nerif.simulation.simulate import simulate
-from nerif.workflow.job import Run
 from nerif.workflow.pipeline import reconstruct_into
+from nerif.workflow.run_settings import Run
 from refusals import refused
 
 BOX = Box((-20.0,) * 3, (20.0,) * 3)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from nerif.fields.network import Network, NetworkShape, NeuralField
+from nerif.fields.network import Network, NeuralField
+from nerif.fields.network_shape import NetworkShape
 from nerif.geometry import Box, Rays
 from nerif.reconstruction.neural.sampling import DENSITY_BINS, EVEN_SHARE, SamplingDensity, sample_count, sample_rays
 from nerif.reconstruction.neural.training_data import shuffled

@@ -9,7 +9,7 @@ from itertools import pairwise
 import pytest
 import torch
 
-from nerif.fields.network import NetworkShape
+from nerif.fields.network_shape import NetworkShape
 from nerif.reconstruction.neural import schedule as module
 from nerif.reconstruction.neural import trainer
 from nerif.reconstruction.neural.fit_monitor import EMPTY_RATE, EMPTY_STEPS, MIN_STEPS, FitMonitor
@@ -21,8 +21,8 @@ from nerif.reconstruction.progress import Monitor
 from nerif.reconstruction.reconstructor import Step
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.results.live import read_live
-from nerif.workflow.job import Run
 from nerif.workflow.pipeline import reconstruct_into
+from nerif.workflow.run_settings import Run
 
 SMALL = NeRIF(network=NetworkShape(depth=1, width=8, octaves=1), points_per_batch=256, device="cpu")
 

@@ -22,7 +22,7 @@ from nerif.reconstruction.voxels.operator import VoxelOperator
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.reconstruction.voxels.total_variation import TotalVariation
 from nerif.reconstruction.voxels.voxel_problem import Iterate
-from nerif.reconstruction.voxels.voxel_reconstructor import COMPILER_BYTES
+from nerif.reconstruction.voxels.voxel_settings import COMPILER_BYTES
 from refusals import refused
 
 LEAST_CC = {Tikhonov: 0.94, Landweber: 0.86, TotalVariation: 0.98}  # five views are few

@@ -12,7 +12,8 @@ import pytest
 import torch
 
 from nerif.fields.field import Field
-from nerif.fields.network import Network, NetworkShape, NeuralField
+from nerif.fields.network import Network, NeuralField
+from nerif.fields.network_shape import NetworkShape
 from nerif.fields.symmetric import SymmetricNetwork
 from nerif.fields.voxel_field import VoxelField
 from nerif.forward.deflection import MODELS

@@ -28,7 +28,8 @@ from nerif.report import figures
 from nerif.report.calibration_figure import draw_errors
 from nerif.report.displacement_figure import save_displacements
 from nerif.report.isosurface import default_level, draw_isosurface, stl_of, surface_triangles
-from nerif.report.journal_figures import JOURNALS, figures_of, residuals_over_sigma, slices, view
+from nerif.report.journal_figures import figures_of, residuals_over_sigma, slices, view
+from nerif.report.journals import JOURNALS
 from nerif.report.rig_figure import draw_two_sides
 from nerif.report.slice_images import bar_image, slice_aspect, slice_image
 from nerif.results.directory import Result, ResultDirectory

@@ -15,7 +15,7 @@ from nerif.cli.cli import main
 from nerif.data.measurement_sequence import add_frames
 from nerif.data.volume import Volume
 from nerif.data.volume_sequence import VolumeSequence
-from nerif.fields.network import NetworkShape
+from nerif.fields.network_shape import NetworkShape
 from nerif.fields.phantoms import Flame
 from nerif.geometry import Box, Grid
 from nerif.report import sequence_page

@@ -17,9 +17,9 @@ from nerif.reconstruction.reconstructor import Step
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.results import live
 from nerif.results.live import Live, read_live, read_snapshot
-from nerif.simulation.simulate import Simulation
-from nerif.workflow.job import Run
+from nerif.simulation.simulation import Simulation
 from nerif.workflow.pipeline import reconstruct_into
+from nerif.workflow.run_settings import Run
 
 RING = Ring(views=4, arc=(0.0, 135.0), image_size=(12, 18), pixel_pitch=0.22)
 METHODS = [NeRIF(max_steps=10, points_per_batch=256), Tikhonov(voxels=8, iterations=10, regularisation=0.1)]

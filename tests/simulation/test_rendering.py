@@ -12,7 +12,8 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 
 from nerif.fields.phantoms import Scaled
 from nerif.geometry import PROJECTIONS, Box, Camera, Lens, Ring
-from nerif.simulation.rendering import Sensor, Texture, background_texture, pattern_size, render
+from nerif.simulation.experiment_settings import Sensor
+from nerif.simulation.rendering import Texture, background_texture, pattern_size, render
 from nerif.simulation.simulate import view_displacement
 from refusals import refused
 

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from nerif.fields.network import NetworkShape
+from nerif.fields.network_shape import NetworkShape
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.progress import Monitor
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
@@ -15,7 +15,8 @@ from nerif.results.directory import ResultDirectory
 from nerif.results.metrics_file import Metrics
 from nerif.workflow import budget
 from nerif.workflow.budget import LEAST, NO_LIMIT, Budget
-from nerif.workflow.job import Job, Run
+from nerif.workflow.job import Job
+from nerif.workflow.run_settings import Run
 from nerif.workflow.steps import CLOSING, STEPS, Bootstrap, DrawErrors
 
 

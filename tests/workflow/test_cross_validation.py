@@ -13,7 +13,7 @@ import torch
 from nerif.analysis.evaluation import evaluate_views
 from nerif.analysis.prediction import reproject
 from nerif.cli.cli import main
-from nerif.fields.network import NetworkShape
+from nerif.fields.network_shape import NetworkShape
 from nerif.fields.voxel_field import VoxelField
 from nerif.geometry import Grid
 from nerif.geometry.pose import GEOMETRY, Corrections
@@ -25,8 +25,8 @@ from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.report.summary import accuracy_rows, statements
 from nerif.results.directory import ResultDirectory
 from nerif.workflow.cross_validation import MIN_VIEWS, CrossValidation, withheld_views
-from nerif.workflow.job import Run
 from nerif.workflow.pipeline import reconstruct_into
+from nerif.workflow.run_settings import Run
 
 VOXELS = Tikhonov(voxels=16, basis="linear", iterations=8, regularisation=0.1, device="cpu")
 SHAPE = NetworkShape(depth=2, width=24, octaves=2)

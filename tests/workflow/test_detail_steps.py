@@ -16,8 +16,8 @@ from nerif.reconstruction.progress import Monitor
 from nerif.reconstruction.voxels.total_variation import TotalVariation
 from nerif.results.directory import ResultDirectory
 from nerif.simulation.simulate import simulate
-from nerif.workflow.job import Run
 from nerif.workflow.pipeline import reconstruct_into
+from nerif.workflow.run_settings import Run
 from nerif.workflow.steps import MOST_BLURRED, MOST_DETAIL, share
 from refusals import refused
 

@@ -14,8 +14,9 @@ from nerif.reconstruction.neural.presets import preset
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.results.directory import ResultDirectory
 from nerif.simulation.simulate import simulate
-from nerif.workflow.job import Run, grown
+from nerif.workflow.job import grown
 from nerif.workflow.pipeline import reconstruct_into
+from nerif.workflow.run_settings import Run
 from refusals import refused
 
 WHOLE, CUT = Box.cube(40.0), Box((-20.0, -20.0, -20.0), (20.0, 20.0, 2.0))

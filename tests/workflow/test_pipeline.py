@@ -26,8 +26,8 @@ from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.report.rig_figure import image_corners
 from nerif.results.directory import CALIBRATION, FILES, MERIDIAN, REPORT, ResultDirectory
 from nerif.workflow import steps
-from nerif.workflow.job import Run
 from nerif.workflow.pipeline import reconstruct_into
+from nerif.workflow.run_settings import Run
 from refusals import refused
 
 QUICK = Tikhonov(voxels=8, basis="linear", iterations=4, regularisation=0.1, device="cpu")

@@ -32,7 +32,7 @@ from nerif.common.conventions import FACES, InputError
 from nerif.common.findings import Finding
 from nerif.data.measurement import Measurement, measurement_of
 from nerif.data.measurement_data import Observation, integrals_of
-from nerif.data.volume import INDEX
+from nerif.data.quantity_names import INDEX
 from nerif.fields.field import Field
 from nerif.forward.forward_model import ForwardModel
 from nerif.forward.path_integral import PathIntegral

@@ -24,14 +24,15 @@ from nerif.common.arrays import filled
 from nerif.common.conventions import InputError, with_unit
 from nerif.data.measurement import Measurement
 from nerif.data.measurement_data import Observation
+from nerif.data.quantity_names import INDEX
 from nerif.data.reprojection import Reprojection
-from nerif.data.volume import INDEX, Volume
+from nerif.data.volume import Volume
 from nerif.data.volume_file import read_volume
 from nerif.fields.field import Field
 from nerif.fields.voxel_field import VoxelField
 from nerif.forward.forward_model import masked_blur
 from nerif.forward.images import Images
-from nerif.forward.registry import AUTO
+from nerif.forward.model_names import AUTO
 from nerif.geometry import Box
 from nerif.geometry.body import contained
 from nerif.plotting.notebook import number

@@ -13,8 +13,8 @@ from torch import Tensor
 from nerif.common.conventions import InputError
 from nerif.common.pauses import pause
 from nerif.data.measurement import Measurement, measurement_of
+from nerif.data.quantity_names import name_of
 from nerif.data.reprojection import Accuracy, Reprojection
-from nerif.data.volume import name_of
 from nerif.fields.field import Field
 from nerif.fields.network import Network, NeuralField
 from nerif.fields.sum import SumField
@@ -25,7 +25,7 @@ from nerif.forward.forward_model import ForwardModel
 from nerif.forward.images import Images
 from nerif.forward.path_integral import LENS_RAYS, FieldProjector, PathIntegral, project
 from nerif.forward.ray_tracing import CurvedRays
-from nerif.forward.registry import ASSUMED, AUTO, TECHNIQUES, check_simulated, forward_model, forward_models
+from nerif.forward.registry import ASSUMED, TECHNIQUES, check_simulated, forward_model, forward_models
 from nerif.geometry import Box, Camera, Grid, Rays
 from nerif.reconstruction.device import on_free_cores
 from nerif.reconstruction.voxels.operator import rays_through

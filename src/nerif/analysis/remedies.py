@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from nerif.reconstruction.rig_parameters import refined_groups
+from nerif.reconstruction.rig_groups import refined_groups
 from nerif.results.directory import Result
 
 __all__ = [

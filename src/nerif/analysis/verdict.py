@@ -32,7 +32,7 @@ from nerif.analysis.asymmetry import camera_of
 from nerif.analysis.image_edges import REMEDY
 from nerif.analysis.remedies import CHECK, DEVIATIONS, SYMMETRY, WITHHOLD, advice, is_fitted, likely_cause, longer
 from nerif.common.conventions import percent
-from nerif.data.volume import field_of
+from nerif.data.quantity_names import field_of
 from nerif.forward.registry import TECHNIQUES
 from nerif.results.directory import Result
 from nerif.results.metrics_file import HalfAsymmetry, ResidualTest, ViewScores

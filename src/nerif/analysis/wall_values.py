@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from nerif.data.quantity_names import INDEX
 from nerif.data.surface import SurfaceMap
-from nerif.data.volume import INDEX
 from nerif.fields.field import Field, in_chunks
 from nerif.geometry import Box
 from nerif.geometry.body import Body, contained, fine_triangles

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Annotated
 
 from nerif.app.server.guard import ADDRESS
-from nerif.cli.settings import Settings, read_settings
+from nerif.cli.settings import Settings, compute, read_settings
 from nerif.common.conventions import InputError
 from nerif.common.installation import install
 from nerif.common.settings import Append, Positional
@@ -85,4 +85,4 @@ def run(settings: App) -> None:
 
 def main(arguments: list[str]) -> None:
     """Parse the arguments and start the server."""
-    run(read_settings(App(), arguments, "app"))
+    compute(run, read_settings(App(), arguments, "app"))

@@ -106,9 +106,7 @@ def _run(words: list[str]) -> int:
     try:
         check_arguments(words[0], words[1:])
         command = importlib.import_module(MODULES.get(words[0], f"nerif.cli.commands.{words[0]}"))
-        device = importlib.import_module("nerif.reconstruction.device")
-        device.keep_freed_memory()
-        device.on_free_cores(command.main)(words[1:])
+        command.main(words[1:])
     except InputError as error:
         return _fail(str(error))
     except KeyboardInterrupt as stop:

@@ -14,7 +14,7 @@ from nerif.common.conventions import InputError
 from nerif.common.files import local_path, read_toml
 from nerif.common.settings import MISSING, Positional, check_settings, merge, options
 
-__all__ = ["COMMAND_LINE_ONLY", "Settings", "command", "read_settings", "setting_of"]
+__all__ = ["COMMAND_LINE_ONLY", "Settings", "command", "compute", "read_settings", "setting_of"]
 
 IGNORED_TABLES = ("about",)  # results in run.toml
 COMMAND_LINE_ONLY = ("allowed_host", "cluster", "dashboard", "force", "host", "root_path")
@@ -44,15 +44,24 @@ class Settings:
 
 
 S = TypeVar("S", bound=Settings)
+R = TypeVar("R")
 
 
 def command(name: str, settings: type[S], run: Callable[[S], object]) -> Callable[[list[str]], None]:
     """Return the function that parses the arguments of a command and runs it."""
 
     def main(arguments: list[str]) -> None:
-        run(settings.read(arguments, name))
+        compute(run, settings.read(arguments, name))
 
     return main
+
+
+def compute(run: Callable[[S], R], settings: S) -> R:
+    """Run a command with PyTorch on free cores; PyTorch is first imported here, once the settings are valid."""
+    from nerif.reconstruction.device import keep_freed_memory, on_free_cores
+
+    keep_freed_memory()
+    return on_free_cores(run)(settings)
 
 
 def read_settings(default: S, arguments: list[str], name: str, file: Path | None = None) -> S:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -21,15 +20,14 @@ from nerif.forward.registry import TECHNIQUES, forward_model
 from nerif.geometry import Box, Camera, Rays
 from nerif.geometry.body import Body
 from nerif.geometry.plausibility import background_cuts, likely_cause, rays_on_lattice
+from nerif.geometry.region import Region, check_region
 
-__all__ = ["MASKS", "MeasurementData", "Observation", "Region", "arguments_of", "check_region", "integrals_of"]
+__all__ = ["MASKS", "MeasurementData", "Observation", "arguments_of", "integrals_of"]
 
 MASKS = ("valid", "flow_mask", "hidden")
 """Fields of a measurement that are masks (view, row, column)."""
 WAVELENGTHS_NM = (100.0, 30000.0)  # ultraviolet to thermal infrared
 PIXELS_AT_A_TIME = 1 << 17  # whose rays are traced together
-Region = tuple[float, float, float, float, float, float]
-"""A box x0 x1 y0 y1 z0 z1, mm, which may be as small as a point."""
 Data = TypeVar("Data", bound="MeasurementData")
 
 
@@ -519,18 +517,3 @@ class MeasurementData:
         sigma = "known" if all(o.sigma is not None for o in self.observations) else "unknown"
         views_of = f"{views} view{'s' * (views > 1)} of {rows} x {columns} px ({', '.join(self.names)})"
         return f"<Measurement of {kinds}: {views_of}, sigma {sigma}; box of {x:g} x {y:g} x {z:g} mm>"
-
-
-def check_region(region: Region, box: Box | None = None) -> None:
-    """Raise InputError if a region x0 x1 y0 y1 z0 z1 (mm) is not a box, or is outside the box of a measurement."""
-    got = " ".join(f"{value:g}" for value in region)
-    lower, upper = region[::2], region[1::2]
-    if len(region) != 6 or not all(a <= b and abs(a) < math.inf > abs(b) for a, b in zip(lower, upper, strict=False)):
-        raise InputError(f"expected x0 x1 y0 y1 z0 z1 in mm, x0 <= x1, got {got}", field="ambient_region")
-    inside = box is None or all(
-        a >= c and b <= d for a, b, c, d in zip(lower, upper, box.lower, box.upper, strict=True)
-    )
-    if not inside:
-        assert box is not None
-        edges = " ".join(f"{value:g}" for pair in zip(box.lower, box.upper, strict=True) for value in pair)
-        raise InputError(f"expected a region within the box {edges} mm, got {got}", field="ambient_region")

@@ -17,13 +17,14 @@ from nerif.common.conventions import COMPONENTS, DEFAULT_AMBIENT_FACES, InputErr
 from nerif.common.memory import check_memory
 from nerif.common.netcdf import reading, values
 from nerif.data.kinds import BOST, known_conventions
-from nerif.data.measurement_data import MASKS, MeasurementData, Region
+from nerif.data.measurement_data import MASKS, MeasurementData
 from nerif.forward.deflection import Deflection
 from nerif.forward.forward_model import ForwardModel
 from nerif.forward.images import Images
 from nerif.forward.registry import TECHNIQUES, technique
 from nerif.geometry import PERSPECTIVE, Box, Camera, Lens, Plane, Projection, projection_named
 from nerif.geometry.body import Body
+from nerif.geometry.region import Region
 
 if TYPE_CHECKING:
     import xarray as xr

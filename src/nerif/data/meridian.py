@@ -17,7 +17,8 @@ import torch
 from nerif.common.conventions import FACES
 from nerif.common.files import atomic
 from nerif.common.netcdf import write_dataset
-from nerif.data.volume import Volume, describe
+from nerif.data.quantity_names import describe
+from nerif.data.volume import Volume
 from nerif.geometry.symmetry import Symmetry
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from nerif.common.netcdf import opened, values, write_dataset
-from nerif.data.volume import describe
+from nerif.data.quantity_names import describe
 from nerif.data.vti import write_vtp
 
 __all__ = ["SurfaceMap"]

@@ -16,7 +16,8 @@ from torch import Tensor
 
 from nerif.common.conventions import InputError
 from nerif.data.kinds import VELOCITY, VELOCITY_KIND, kind_of
-from nerif.data.volume import COMPONENTS, FLOW_QUANTITIES, Volume, export
+from nerif.data.quantity_names import FLOW_QUANTITIES
+from nerif.data.volume import COMPONENTS, Volume, export
 from nerif.data.volume_sequence import VolumeSequence
 from nerif.geometry import Grid
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,6 +19,7 @@ from nerif.common.axis_order import order_remedy
 from nerif.common.conventions import STATISTICS, InputError, ambient_index
 from nerif.common.files import atomic, ending
 from nerif.common.netcdf import write_dataset
+from nerif.data.quantity_names import INDEX_QUANTITIES, QUANTITIES, describe, field_of, name_of
 from nerif.data.vti import write_vti
 from nerif.geometry import Grid
 
@@ -28,63 +28,13 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 __all__ = [
-    "COMPONENTS", "FLOW_QUANTITIES", "FORMATS", "INDEX", "QUANTITIES", "REFERENCES", "Volume", "describe", "export",
-    "field_of", "name_of", "quantities_of", "to_dataset", "write_csv", "write_mat", "write_netcdf", "write_npz",
+    "COMPONENTS", "FORMATS", "REFERENCES", "Volume", "export", "to_dataset", "write_csv", "write_mat", "write_netcdf",
+    "write_npz",
 ]  # fmt: skip
 
-QUANTITIES = {
-    "index_excess": ("1", "refractive index minus that of the ambient"),
-    "n": ("1", "refractive index"),
-    "density": ("kg m-3", "density"),
-    "temperature": ("K", "temperature"),
-    "extinction": ("mm-1", "extinction coefficient"),
-    "emission": ("mm-1", "radiance per length"),
-}
-"""Unit and long name of the quantities of volumes."""
-
-FLOW_QUANTITIES = {
-    "u": ("m s-1", "velocity along x"),
-    "v": ("m s-1", "velocity along y"),
-    "w": ("m s-1", "velocity along z"),
-    "speed": ("m s-1", "speed"),
-    "vorticity": ("s-1", "magnitude of the vorticity"),
-    "pressure": ("Pa", "pressure relative to its mean"),
-    "transport_residual": ("s-1", "change of density / reference density that the velocity does not explain"),
-    "momentum_residual": ("m s-2", "acceleration that the equation of momentum does not explain"),
-}
-"""Unit and long name of the quantities of a flow."""
-
 COMPONENTS = ("u", "v", "w")
-INDEX = "index_excess"
-INDEX_QUANTITIES = (INDEX, "n", "density", "temperature")
 CELL_METHODS = {"mean": "mean", "std": "standard_deviation"}  # of CF
 REFERENCES = "Y. He et al., Neural refractive index field, arXiv:2409.14722"
-
-
-def quantities_of(quantity: str) -> tuple[str, ...]:
-    """Return the quantities that follow from a reconstructed field."""
-    return INDEX_QUANTITIES if quantity == INDEX else (quantity,)
-
-
-def field_of(quantities: Iterable[str]) -> str | None:
-    """Return which of the quantities of a result is the reconstructed field."""
-    fields = [q for q in quantities if q.rpartition("_")[2] not in STATISTICS and q not in INDEX_QUANTITIES[1:]]
-    return INDEX if INDEX in fields else next(iter(fields), None)
-
-
-def name_of(quantity: str) -> str:
-    """Return the name of the reconstructed field, such as refractive index."""
-    return describe("n" if quantity == INDEX else quantity)[1]
-
-
-def describe(quantity: str) -> tuple[str, str]:
-    """Return unit and long name of a quantity such as density, or density_std."""
-    base, _, statistic = quantity.rpartition("_")
-    names = QUANTITIES | FLOW_QUANTITIES
-    if statistic in STATISTICS and base in names:
-        unit, name = names[base]
-        return "1" if statistic == "certainty" else unit, f"{STATISTICS[statistic]} of {name}"
-    return names.get(quantity, ("1", quantity))
 
 
 @dataclass(frozen=True, repr=False)

@@ -15,7 +15,8 @@ from nerif.common.conventions import LARGEST_INDEX, LARGEST_LENGTH, InputError
 from nerif.common.files import ending, instead_of_file
 from nerif.common.netcdf import opened, values
 from nerif.data.kinds import VOLUME, reading_as
-from nerif.data.volume import QUANTITIES, Volume, describe, field_of
+from nerif.data.quantity_names import QUANTITIES, describe, field_of
+from nerif.data.volume import Volume
 from nerif.data.vti import read_vti
 from nerif.geometry import Box, Grid
 

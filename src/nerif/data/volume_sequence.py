@@ -15,7 +15,8 @@ from nerif.common.netcdf import reading
 from nerif.common.times import check_interval, interval, seconds
 from nerif.data.kinds import SEQUENCE_RESULT, TRUE_SEQUENCE, Kind, check_kind, reading_as
 from nerif.data.measurement_sequence import ZARR_FORMAT, add_frames, check_instants, check_store, require_zarr
-from nerif.data.volume import REFERENCES, Volume, describe, field_of, name_of
+from nerif.data.quantity_names import describe, field_of, name_of
+from nerif.data.volume import REFERENCES, Volume
 from nerif.forward.forward_model import ForwardModel
 from nerif.forward.registry import ASSUMED, technique
 from nerif.geometry import Box, Grid

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from nerif.fields.network import UNBOUNDED, Network, NetworkShape
+from nerif.fields.network import UNBOUNDED, Network
+from nerif.fields.network_shape import NetworkShape
 from nerif.fields.symmetric import SymmetricNetwork
 from nerif.fields.walls import WallNetwork
 from nerif.geometry import Box

@@ -12,7 +12,8 @@ from torch import Tensor, nn
 from nerif.common.arrays import Points, Values, Vectors
 from nerif.common.conventions import InputError
 from nerif.fields.field import Field, in_chunks
-from nerif.fields.network import ACTIVATIONS, UNBOUNDED, Network, NetworkShape, NeuralField, encode, encode_pullback
+from nerif.fields.network import ACTIVATIONS, UNBOUNDED, Network, NeuralField, encode, encode_pullback
+from nerif.fields.network_shape import NetworkShape
 from nerif.fields.sum import SumField
 from nerif.fields.voxel_field import VoxelField
 from nerif.geometry import Grid

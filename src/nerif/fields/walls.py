@@ -16,7 +16,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerif.fields.network import UNBOUNDED, Network, NetworkShape, encode_pullback
+from nerif.fields.network import UNBOUNDED, Network, encode_pullback
+from nerif.fields.network_shape import NetworkShape
 from nerif.geometry.body import Body, from_surface
 
 __all__ = ["WallNetwork"]

@@ -5,17 +5,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from nerif.common.conventions import InputError
-from nerif.forward import absorption, deflection
 from nerif.forward.absorption import Absorption
 from nerif.forward.deflection import Deflection
 from nerif.forward.emission import Emission
 from nerif.forward.forward_model import ForwardModel, Light
 from nerif.forward.images import Images
 from nerif.forward.interferometry import Interferometry
+from nerif.forward.model_names import AUTO, MODEL_NAMES, MODELS
 
 __all__ = [
-    "AUTO", "MODELS", "MODEL_NAMES", "TECHNIQUES", "check_model", "check_simulated", "forward_model", "forward_models",
-    "model_of", "technique", "technique_of",
+    "TECHNIQUES", "check_model", "check_simulated", "forward_model", "forward_models", "model_of", "technique",
+    "technique_of",
 ]  # fmt: skip
 
 # by their names in files; a technique of your own is one more entry
@@ -23,12 +23,6 @@ TECHNIQUES: dict[str, type[ForwardModel]] = {
     c.name: c for c in (Deflection, Images, Absorption, Emission, Interferometry)
 }
 ASSUMED = Deflection  # of files without the attribute: version 1.0, and stores
-AUTO = "auto"
-# names of the models of techniques that have several, the default first
-MODELS: dict[str, tuple[str, ...]] = {
-    Deflection.name: tuple(deflection.MODELS), Images.name: ("lever_arm",), Absorption.name: tuple(absorption.MODELS)
-}  # fmt: skip
-MODEL_NAMES = (AUTO, *(name for names in MODELS.values() for name in names))
 
 
 def technique(name: str) -> type[ForwardModel]:

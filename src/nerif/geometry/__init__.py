@@ -1,12 +1,5 @@
-"""Cameras, rays, boxes and grids."""
+"""Cameras, rays, boxes and grids; loaded on first use, since PyTorch takes seconds."""
 
-from nerif.geometry.camera import PERSPECTIVE, PROJECTIONS, TELECENTRIC, Camera, Plane, Projection, projection_named
-from nerif.geometry.grid import Box, Grid
-from nerif.geometry.lens import Lens, LensDiscs, spread_points
-from nerif.geometry.rays import BackgroundPoints, Rays
-from nerif.geometry.rig import Ring, paper_rig
+import lazy_loader
 
-__all__ = [
-    "PERSPECTIVE", "PROJECTIONS", "TELECENTRIC", "BackgroundPoints", "Box", "Camera", "Grid", "Lens", "LensDiscs",
-    "Plane", "Projection", "Rays", "Ring", "paper_rig", "projection_named", "spread_points",
-]  # fmt: skip
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

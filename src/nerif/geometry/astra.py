@@ -28,9 +28,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerif.common.conventions import InputError, whole
-from nerif.geometry.camera import PERSPECTIVE, TELECENTRIC, Camera, Projection
+from nerif.geometry.camera import Camera
 from nerif.geometry.distortion import sensor_axes
 from nerif.geometry.grid import Box, Grid
+from nerif.geometry.projection import PERSPECTIVE, TELECENTRIC, Projection
 
 __all__ = [
     "PROJECTIONS_OF", "astra_of", "camera_of", "check_vectors", "depth_behind", "from_astra", "vectors_of",

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
-
-import numpy as np
-import torch
+from typing import TYPE_CHECKING, Literal
 
 from nerif.common.conventions import InputError
 from nerif.common.settings import Count, Length, check_settings
-from nerif.geometry.camera import MAX_TILT, PROJECTIONS, Camera, Plane, Projection, projection_named
-from nerif.geometry.grid import Box
+from nerif.geometry.projection import MAX_TILT, PROJECTIONS, Projection, projection_named
+
+if TYPE_CHECKING:
+    from nerif.geometry.camera import Camera
+    from nerif.geometry.grid import Box
 
 __all__ = ["Ring", "paper_rig"]
 
@@ -49,8 +49,9 @@ class Ring:
     def __post_init__(self) -> None:
         check_settings(self)
         for name in ("arc", "extra_angles", "elevation", "sensor_tilt"):
-            if not math.isfinite(math.fsum(np.atleast_1d(getattr(self, name)))):
-                raise InputError(f"expected degrees, got {getattr(self, name)}", field=name)
+            angles = getattr(self, name)
+            if not math.isfinite(math.fsum(angles if isinstance(angles, tuple) else (angles,))):
+                raise InputError(f"expected degrees, got {angles}", field=name)
         if max(map(abs, self.sensor_tilt)) >= MAX_TILT:
             raise InputError(f"expected below {MAX_TILT:g} degrees, got {self.sensor_tilt}", field="sensor_tilt")
         if self.magnification is not None and self.kind.shows_depth:
@@ -83,6 +84,10 @@ class Ring:
         return tuple(camera.with_f_number(self.pixel_pitch, f_number) for camera in cameras)
 
     def _camera(self, azimuth: float, name: str) -> Camera:
+        import torch
+
+        from nerif.geometry.camera import Camera, Plane
+
         a, e = math.radians(azimuth), math.radians(self.elevation)
         outward = torch.tensor([math.cos(a) * math.cos(e), math.sin(a) * math.cos(e), math.sin(e)], dtype=torch.float64)
         forward = -outward
@@ -113,5 +118,7 @@ def paper_rig(pixels: int = 200, extra_angles: tuple[float, ...] = ()) -> tuple[
     does not state the distances; here they are 700 mm to the centre and another 500 mm to the background. With other
     `pixels` the size of the sensor stays the same.
     """
+    from nerif.geometry.grid import Box
+
     ring = Ring(pixel_pitch=0.02 * 200 / pixels, image_size=(pixels, pixels), extra_angles=extra_angles)
     return ring.cameras(), Box.cube(50.0)

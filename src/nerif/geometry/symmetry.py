@@ -15,7 +15,6 @@ f_k is the field at the azimuth a_k; on the axis only the mean remains.
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
@@ -28,29 +27,14 @@ from torch import Tensor
 from nerif.common.arrays import Points, Vectors
 from nerif.common.conventions import FACES, InputError
 from nerif.geometry.grid import Box
+from nerif.geometry.symmetry_names import MAX_HARMONICS, NO_SYMMETRY, parse_symmetry
 
 __all__ = ["NAMES", "NO_SYMMETRY", "Axis", "Symmetry", "parse_symmetry"]
 
-NO_SYMMETRY = "none"
-MAX_HARMONICS = 8
 COS_45 = math.cos(math.radians(45))  # faces whose normals are further than 45 degrees from a direction lie along it
 MAX_POSTERIOR = 0.5  # of the prior standard deviation, of a parameter that the data constrain
 NAMES = ("shift_1", "shift_2", "lean_1", "lean_2")
 """Shifts (mm) of an axis along e1 and e2 of the frame, leans (rad) towards them."""
-
-
-def parse_symmetry(text: str) -> tuple[str, int] | None:
-    """Return kind and number of harmonics of a symmetry (none, axis, axis+N or planar); None for none."""
-    if text == NO_SYMMETRY:
-        return None
-    match = re.fullmatch(r"(planar)|axis(?:\+(\d+))?", text)
-    if not match or int(match[2] or 0) > MAX_HARMONICS:
-        raise InputError(
-            f"expected {NO_SYMMETRY}, axis, axis+N (N harmonics of the azimuth, at most {MAX_HARMONICS}) or "
-            f"planar, got '{text}'",
-            field="symmetry",
-        )
-    return match[1] or "axis", int(match[2] or 0)
 
 
 @dataclass(frozen=True)

@@ -29,8 +29,9 @@ from torch import Tensor
 from nerif.common.arrays import Matrix3
 from nerif.common.conventions import InputError, whole
 from nerif.geometry.astra import check_vectors, depth_behind, vectors_of
-from nerif.geometry.camera import PERSPECTIVE, Camera
+from nerif.geometry.camera import Camera
 from nerif.geometry.grid import Grid
+from nerif.geometry.projection import PERSPECTIVE
 
 __all__ = ["from_tigre", "tigre_of"]
 

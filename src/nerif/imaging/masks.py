@@ -5,23 +5,22 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
 import torch
-from annotated_types import Ge
 from jaxtyping import Bool, Shaped
 
 from nerif.common.conventions import InputError, unit_shown
 from nerif.common.files import atomic, ending, is_file_name
 from nerif.common.image_names import FOLDER_SUFFIXES
-from nerif.common.settings import NonNegative, Positive, check_settings
+from nerif.common.settings import Positive, check_settings
 from nerif.data.measurement import Measurement
 from nerif.data.measurement_data import Observation, integrals_of
+from nerif.imaging.imaging_settings import MaskSettings
 from nerif.imaging.readers.frames import as_float
 from nerif.imaging.readers.open import read_mask
 
-__all__ = ["MaskSettings", "MaskShape", "drawn_masks", "flow_mask", "mask_of", "with_flow_masks", "write_masks"]
+__all__ = ["MaskShape", "drawn_masks", "flow_mask", "mask_of", "with_flow_masks", "write_masks"]
 
 PixelMask = Bool[np.ndarray, "row column"]
 MIN_POINTS = {"polygon": 3, "brush": 1}
@@ -105,23 +104,6 @@ def write_masks(
         with atomic(paths[name]) as part:
             Image.fromarray(mask.astype(np.uint8) * 255).save(part, format="PNG")
     return list(paths.values())
-
-
-@dataclass(frozen=True)
-class MaskSettings:
-    """Settings of a flow mask by threshold."""
-
-    threshold: NonNegative = 4.0
-    """Flow is where the measured quantity (of displacements |d|) exceeds this multiple of sigma."""
-    smooth: NonNegative = 1.5
-    """Standard deviation of a Gaussian over the values / sigma before the threshold, px."""
-    smallest: Annotated[int, Ge(0)] = 64
-    """Islands and holes of fewer pixels are removed."""
-    grow: Annotated[int, Ge(0)] = 3
-    """Pixels added all around, so that the mask includes the edge of the flow."""
-
-    def __post_init__(self) -> None:
-        check_settings(self)
 
 
 STANDARD = MaskSettings()

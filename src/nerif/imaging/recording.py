@@ -14,19 +14,14 @@ import torch
 from annotated_types import Ge
 from jaxtyping import Bool
 
-from nerif.common.conventions import AMBIENT_INDEX, DEFAULT_AMBIENT_FACES, InputError
+from nerif.common.conventions import InputError
 from nerif.common.settings import check_settings
 from nerif.data.cameras_file import CalibratedCamera
 from nerif.data.measurement import Measurement
 from nerif.geometry import Box, Camera
-from nerif.imaging.displacement.displacement import (
-    OVEREXPOSED,
-    UNEVEN,
-    DisplacementMap,
-    DisplacementSettings,
-    Reference,
-)
-from nerif.imaging.masks import MaskSettings, flow_mask
+from nerif.imaging.displacement.displacement import OVEREXPOSED, UNEVEN, DisplacementMap, Reference
+from nerif.imaging.imaging_settings import DisplacementSettings, MaskSettings, Surroundings
+from nerif.imaging.masks import flow_mask
 from nerif.imaging.quality.reference_outliers import without_outliers
 from nerif.imaging.quality.repetition import Repetition, repetition
 from nerif.imaging.quality.unrelated import unrelated
@@ -35,7 +30,7 @@ from nerif.imaging.readers.views import View, good_images, paired
 from nerif.imaging.shake import row_movement
 from nerif.imaging.workers import cores, work
 
-__all__ = ["Recording", "Scene", "Surroundings", "ViewReference", "camera_of", "join_views", "measure_instant"]
+__all__ = ["Recording", "Scene", "ViewReference", "camera_of", "join_views", "measure_instant"]
 
 PixelMask = Bool[np.ndarray, "row column"]
 
@@ -60,23 +55,11 @@ class ViewMeasurement(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Surroundings:
-    """The gas around the flow, and the light."""
-
-    n_ambient: float = AMBIENT_INDEX
-    """Refractive index around the flow."""
-    wavelength_nm: float = 532.0
-    """Wavelength of the light, nm."""
-    ambient_faces: tuple[str, ...] = DEFAULT_AMBIENT_FACES
-    """Faces of the box on which the index is ambient."""
-
-
-@dataclass(frozen=True)
 class Scene:
     """The parts of a measurement that are common to all views: the box to reconstruct, and its surroundings."""
 
     box: Box
-    surroundings: Surroundings = Surroundings()
+    surroundings: Surroundings = field(default_factory=Surroundings)
 
 
 def join_views(views: Iterable[ViewMeasurement], scene: Scene, images: bool = False) -> Measurement:

@@ -12,13 +12,14 @@ import difflib
 import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from nerif.common.conventions import InputError
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 __all__ = [
     "GASES", "GAS_CONSTANT", "Composition", "Gas", "ambient_index", "density_from_index", "density_from_temperature",
@@ -30,7 +31,7 @@ GAS_CONSTANT = 8.314462618  # J/(mol K), CODATA 2018
 Composition = str | Mapping[str, float]
 """A gas of `GASES`, or mole fractions as a mapping or a text such as ``"CH4:0.112, O2:0.888"``."""
 
-Quantity = TypeVar("Quantity", float, np.ndarray, Tensor)
+Quantity = TypeVar("Quantity", float, np.ndarray, "Tensor")
 
 _ATM = 101325.0  # Pa
 _FRACTION_TOLERANCE = 1.0001e-3  # for three thirds written as 0.333, and rounding
@@ -217,11 +218,11 @@ def temperature_from_density(density: Quantity, pressure_pa: float, molar_mass: 
     pressure = _positive("pressure_pa", pressure_pa, "Pa", "give the absolute pressure, 101325 for one atmosphere")
     mass = _positive("molar_mass", molar_mass, "kg/mol", "see molar_mass")
     scale = pressure * mass / GAS_CONSTANT
-    if isinstance(density, Tensor):
-        return scale / torch.where(density > 0, density, math.nan)
+    if isinstance(density, float | int | np.generic):
+        return scale / density if density > 0 else math.nan
     if isinstance(density, np.ndarray):
         return scale / np.where(density > 0, density, math.nan)
-    return scale / density if density > 0 else math.nan
+    return scale / density.where(density > 0, math.nan)
 
 
 def density_from_temperature(temperature: Quantity, pressure_pa: float, molar_mass: float) -> Quantity:

@@ -8,11 +8,9 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from nerif.common.conventions import InputError, percent
-from nerif.data.volume import QUANTITIES, Volume, quantities_of
+from nerif.data.quantity_names import QUANTITIES, quantities_of
 from nerif.physics.gas_optics import (
     ambient_index,
     density_from_index,
@@ -23,7 +21,10 @@ from nerif.physics.gas_optics import (
 )  # fmt: skip
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from nerif.data.measurement import Measurement
+    from nerif.data.volume import Volume
 
 __all__ = ["NOT_UNIFORM", "GasChanges", "GasSettings", "derive", "derive_all", "deviation", "masked_lines"]
 
@@ -189,6 +190,8 @@ def derive(excess: Volume, quantity: str, gas: GasSettings) -> Volume:
     excess : volume with n_ambient in its attributes
     quantity : index_excess, n, density or temperature
     """
+    from nerif.data.volume import Volume
+
     quantities = quantities_of(excess.quantity)
     if quantity not in quantities:
         raise InputError(f"expected one of {', '.join(quantities)}, got '{quantity}'", field="quantity")
@@ -213,7 +216,7 @@ def derive(excess: Volume, quantity: str, gas: GasSettings) -> Volume:
             f"at a uniform pressure of {gas.pressure_pa:g} Pa; {assumption}"
         )
     if reason := gas.absent(excess).get(quantity):
-        values, where = torch.full_like(excess.values, math.nan), reason
+        values, where = excess.values.new_full(excess.values.shape, math.nan), reason
     else:
         density = density_from_index(excess.values.double(), n_ambient, k)
         values, where = density.masked_fill(~(density > 0), math.nan), "n - 1 <= 0"
@@ -221,7 +224,7 @@ def derive(excess: Volume, quantity: str, gas: GasSettings) -> Volume:
             values = temperature_from_density(density, gas.pressure_pa, mass)
             values = values.masked_fill((values < low) | (values > high), math.nan)
             where += f", or temperature beyond {low:g} to {high:g} K"
-    count, earlier = int(torch.isnan(values).sum()), int(excess.notes.get("masked_voxels", 0))
+    count, earlier = int(values.isnan().sum()), int(excess.notes.get("masked_voxels", 0))
     if earlier:
         where = f"{excess.notes['masked_where']}, or {where}" if count > earlier else str(excess.notes["masked_where"])
     notes: dict[str, float | str] = {"assumption": assumption, "masked_voxels": count, "masked_where": where}

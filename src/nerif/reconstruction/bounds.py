@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 from nerif.common.conventions import InputError
-from nerif.data.measurement import Measurement
+
+if TYPE_CHECKING:
+    from nerif.data.measurement import Measurement
 
 __all__ = ["check_bounds", "check_same_bounds", "field_bounds", "in_units"]
 

@@ -20,10 +20,11 @@ from nerif.common.files import atomic, check_file
 from nerif.common.written_files import OwnFiles
 from nerif.data.kinds import FIELD, RESULT, check_kind
 from nerif.data.measurement import Measurement
-from nerif.data.volume import INDEX
+from nerif.data.quantity_names import INDEX
 from nerif.fields.field import Field
-from nerif.fields.network import Network, NetworkShape, NeuralField
+from nerif.fields.network import Network, NeuralField
 from nerif.fields.network_kinds import network_in
+from nerif.fields.network_shape import NetworkShape
 from nerif.fields.sum import SumField
 from nerif.fields.symmetric import SymmetricNetwork, SymmetricVoxels
 from nerif.fields.voxel_field import VoxelField

@@ -17,10 +17,10 @@ from torch import Tensor
 
 from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
-from nerif.data.measurement_data import Region
-from nerif.data.volume import INDEX
+from nerif.data.quantity_names import INDEX
 from nerif.geometry import Box, Grid
 from nerif.geometry.body import Body, contained
+from nerif.geometry.region import Region
 
 if TYPE_CHECKING:
     from nerif.reconstruction.shared_settings import SharedSettings

@@ -18,7 +18,7 @@ from nerif.data.measurement import Measurement
 from nerif.data.volume import Volume
 from nerif.fields.field import Field
 from nerif.fields.voxel_field import spline_coefficients
-from nerif.forward.registry import AUTO
+from nerif.forward.model_names import AUTO
 from nerif.geometry import Grid
 from nerif.reconstruction.aperture import apply_aperture
 from nerif.reconstruction.device import resolve_device

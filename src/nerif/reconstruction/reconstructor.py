@@ -13,20 +13,20 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from torch import Tensor
-
 from nerif.common.conventions import InputError
-from nerif.data.measurement import Measurement
-from nerif.data.volume import Volume, describe, name_of
-from nerif.fields.field import Field
-from nerif.geometry import Box, Grid
-from nerif.geometry.body import Body, contained
-from nerif.geometry.symmetry import Axis
-from nerif.reconstruction.rig_parameters import RefinedView
 
 if TYPE_CHECKING:
     import xarray as xr
     from matplotlib.figure import Figure
+    from torch import Tensor
+
+    from nerif.data.measurement import Measurement
+    from nerif.data.volume import Volume
+    from nerif.fields.field import Field
+    from nerif.geometry import Box, Grid
+    from nerif.geometry.body import Body
+    from nerif.geometry.symmetry import Axis
+    from nerif.reconstruction.rig_parameters import RefinedView
 
 __all__ = [
     "END", "VOXELS", "OnStep", "Outcome", "Reconstruction", "Reconstructor", "State", "Step", "compose", "sampled",
@@ -163,6 +163,8 @@ class Reconstruction:
 
         Voxels whose centre is within a body are NaN.
         """
+        from nerif.geometry import Grid
+
         grid = grid if isinstance(grid, Grid) else Grid.of_resolution(self.box, grid)
         if not self.box.holds(grid.box):
             raise InputError(
@@ -184,12 +186,15 @@ class Reconstruction:
         self.volume(grid).write(path, force)
 
     def __repr__(self) -> str:
+        from nerif.data.quantity_names import name_of
+
         x, y, z = self.box.edges
         about = f"{name_of(self.quantity)} in {x:g} x {y:g} x {z:g} mm by a {type(self.field).__name__}"
         return f"<Reconstruction of {about}; {self.outcome.reason} after {self.seconds:.1f} s on {self.device}>"
 
     def _repr_html_(self) -> str:
         """Notebook display: the three middle slices, outcome, time and misfit."""
+        from nerif.data.quantity_names import describe
         from nerif.plotting.notebook import number, panel, show_slices
 
         volume = self.volume(NOTEBOOK_VOXELS)
@@ -206,6 +211,9 @@ def sampled(
     field: Field, grid: Grid, quantity: str, n_ambient: float, bodies: Sequence[Body] = (), device: str = "cpu"
 ) -> Volume:
     """Return a field at the voxel centres of a grid, NaN within bodies."""
+    from nerif.data.volume import Volume
+    from nerif.geometry.body import contained
+
     volume = Volume.of(field.sample(grid, device), grid, quantity, n_ambient)
     return volume.masked(contained(bodies, grid.points()), "within a body") if bodies else volume
 

@@ -18,16 +18,13 @@ from nerif.geometry import Camera
 from nerif.geometry.pose import GEOMETRY, Corrections
 
 __all__ = [
-    "GROUPS", "MOVED", "NAMES", "RefinedView", "check_refined", "displaced", "prior", "refinement_lines",
-    "with_corrections",
+    "MOVED", "NAMES", "RefinedView", "displaced", "prior", "refinement_lines", "with_corrections",
 ]  # fmt: skip
 
 IMAGE = ("u", "v", "u_x", "u_y", "v_x", "v_y")
 """Displacement of a whole image, px: constant, and growing from the middle to the edge along columns and rows."""
 NAMES = (*GEOMETRY, *IMAGE)
 UNITS = (*("rad",) * 3, *("mm",) * 3, "1", "mm", *("px",) * 6)
-GROUPS = {"cameras": range(6), "focal": range(6, 7), "background": range(7, 8), "shift": range(8, 14)}
-"""Groups of parameters that can be refined, as indices of NAMES."""
 
 POSE_SIGMA = 0.2, 0.02  # mm, degrees
 ZOOM_SIGMA, BACKGROUND_SIGMA = 1e-3, 0.5  # share of the focal length; mm
@@ -56,21 +53,6 @@ class RefinedView(TypedDict):
     rms_before: NotRequired[float]
     rms_after: NotRequired[float]
     """Residual over sigma as calibrated and as refined, with the same field."""
-
-
-def refined_groups(refine: Sequence[str]) -> tuple[str, ...]:
-    """Return the groups of a setting, whose items may contain several, separated by commas."""
-    return tuple(dict.fromkeys(group for item in refine for group in item.replace(",", " ").split()))
-
-
-def check_refined(refine: Sequence[str], mm: float | None, deg: float | None, px: float) -> None:
-    """Refuse unknown groups and invalid standard deviations."""
-    for group in refined_groups(refine):
-        if group not in GROUPS:
-            raise InputError(f"expected some of {', '.join(GROUPS)}, got '{group}'", field="refine")
-    for name, value in (("pose_sigma_mm", mm), ("pose_sigma_deg", deg), ("shift_sigma_px", px)):
-        if value is not None and not 0 < value < 1e6:
-            raise InputError(f"expected a standard deviation above 0, got {value}", field=name)
 
 
 def displaced(numbers: Float[Tensor, "n 6"], place: Float[Tensor, "n 2"]) -> Float[Tensor, "n 2"]:

@@ -31,13 +31,12 @@ from nerif.geometry import Box, Camera, Rays
 from nerif.geometry.pose import GEOMETRY, Corrections
 from nerif.reconstruction.gauss_newton import Information
 from nerif.reconstruction.reconstructor import Reconstruction
+from nerif.reconstruction.rig_groups import GROUPS, refined_groups
 from nerif.reconstruction.rig_parameters import (
-    GROUPS,
     NAMES,
     RefinedView,
     displaced,
     prior,
-    refined_groups,
     with_corrections,
 )
 from nerif.reconstruction.sources import of_source

@@ -7,11 +7,11 @@ from typing import Annotated, Final, Literal
 
 from nerif.common.conventions import ambient_index, parse_faces
 from nerif.common.settings import NonNegative, OptionName, check_settings
-from nerif.data.measurement_data import Region, check_region
-from nerif.geometry.symmetry import NO_SYMMETRY, parse_symmetry
+from nerif.geometry.region import Region, check_region
+from nerif.geometry.symmetry_names import NO_SYMMETRY, parse_symmetry
 from nerif.reconstruction.bounds import check_bounds
 from nerif.reconstruction.reconstructor import Reconstructor
-from nerif.reconstruction.rig_parameters import check_refined
+from nerif.reconstruction.rig_groups import check_refined
 
 __all__ = ["SHORT_RUN", "Aperture", "SharedSettings", "Source"]
 

@@ -15,7 +15,8 @@ from nerif.data.measurement import Measurement
 from nerif.data.measurement_data import Observation
 from nerif.forward.forward_model import ForwardModel
 from nerif.forward.images import Images
-from nerif.forward.registry import AUTO, forward_models
+from nerif.forward.model_names import AUTO
+from nerif.forward.registry import forward_models
 from nerif.geometry import Rays
 from nerif.reconstruction.bins import binned_rays, patches
 

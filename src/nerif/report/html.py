@@ -13,7 +13,7 @@ from nerif import __version__
 from nerif.analysis.evaluation import rms_with_unit
 from nerif.common.files import atomic
 from nerif.data.meridian import Meridian
-from nerif.data.volume import name_of
+from nerif.data.quantity_names import name_of
 from nerif.forward.registry import technique_of
 from nerif.plotting.drawing import map_colours, plotted_quantities
 from nerif.plotting.notebook import image, number

@@ -17,8 +17,9 @@ from nerif.common.conventions import with_unit
 from nerif.common.files import atomic
 from nerif.common.written_files import OwnFiles
 from nerif.data.measurement_data import Observation
+from nerif.data.quantity_names import INDEX
 from nerif.data.reprojection import Reprojection
-from nerif.data.volume import INDEX, Volume
+from nerif.data.volume import Volume
 from nerif.plotting import drawing
 from nerif.plotting.drawing import (
     add_colour_bar,
@@ -32,6 +33,7 @@ from nerif.plotting.drawing import (
 )
 from nerif.report import figures
 from nerif.report.isosurface import default_level, draw_isosurface
+from nerif.report.journals import JOURNALS
 from nerif.report.meridian_figure import draw_centre_line, draw_profiles, draw_section
 from nerif.report.surface_figure import draw_surface
 from nerif.report.view_images import lattice_step
@@ -40,10 +42,7 @@ from nerif.results.directory import Result
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["JOURNALS", "error_of", "figures_of", "residuals_over_sigma", "save_figures"]
-
-JOURNALS = {"elsevier": (90, 190), "aip": (85, 170), "aps": (86, 178), "nature": (89, 183), "springer": (84, 174)}
-"""Widths of one and of two columns, mm, by the publishers' guides for authors."""
+__all__ = ["error_of", "figures_of", "residuals_over_sigma", "save_figures"]
 
 NOT_IN_FILES = r"[^\w.+-]"
 HATCHED_STD = 0.1  # standard deviation over the range of the colours, above which slices are hatched

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -14,12 +13,13 @@ from nerif.common.arrays import filled
 from nerif.common.conventions import InputError
 from nerif.common.files import atomic, ending
 from nerif.common.installation import install
-from nerif.common.settings import check_settings
+from nerif.data.quantity_names import field_of
 from nerif.data.velocity_sequence import VelocitySequence
-from nerif.data.volume import Volume, field_of
+from nerif.data.volume import Volume
 from nerif.data.volume_sequence import VolumeSequence
 from nerif.plotting.drawing import COLOUR_MAPS, LABELS, SEQUENTIAL, colour_range, plotted_values
 from nerif.report.isosurface import default_level
+from nerif.report.movie_settings import MovieSettings
 
 __all__ = ["Movie", "finished_frames", "ranges_over_time"]
 
@@ -29,31 +29,8 @@ ARROWS, STREAMLINES = 20, 250  # along the longest edge; in all
 SLOW = 0.03  # of the largest speed, below which an arrow is a dot
 
 
-@dataclass(frozen=True)
-class Movie:
-    """Settings of a movie."""
-
-    style: Literal["isosurface", "slices", "arrows", "streamlines"] = "isosurface"
-    """Isosurface, or three slices through the centre of the box; of a velocity also arrows or streamlines."""
-    quantity: str = ""
-    """Quantity to draw (default: density, the field if it is another than the index, or the speed)."""
-    level: float | None = None
-    """Value of the isosurface, in the plotted unit (default: halfway between the ambient and the extreme)."""
-    size: tuple[int, int] = (960, 720)
-    """Width and height, px."""
-    azimuth: float = 35.0
-    """Direction of the viewpoint around z, degrees."""
-    elevation: float = 20.0
-    """Height of the viewpoint, degrees."""
-    frames_per_second: float = 20.0
-    """Frames per second of the movie."""
-
-    def __post_init__(self) -> None:
-        check_settings(self)
-        if min(self.size) < 16 or any(s % 2 for s in self.size):
-            raise InputError(f"expected an even width and height of 16 px or more, got {self.size}", field="size")
-        if not self.frames_per_second > 0:
-            raise InputError(f"expected a positive number, got {self.frames_per_second}", field="frames_per_second")
+class Movie(MovieSettings):
+    """A movie of a sequence of volumes."""
 
     def quantity_of(self, store: VolumeSequence) -> str:
         """Return the quantity that is drawn of a store."""

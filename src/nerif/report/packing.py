@@ -14,7 +14,8 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from nerif.data.volume import INDEX, Volume, quantities_of
+from nerif.data.quantity_names import INDEX, quantities_of
+from nerif.data.volume import Volume
 from nerif.geometry import Grid
 from nerif.physics.gas_optics import GAS_CONSTANT
 from nerif.physics.quantities import TEMPERATURE_RANGE

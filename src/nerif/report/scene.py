@@ -9,7 +9,8 @@ import numpy as np
 import torch
 
 from nerif.common.conventions import unit_shown
-from nerif.data.volume import INDEX, Volume, name_of, quantities_of
+from nerif.data.quantity_names import INDEX, name_of, quantities_of
+from nerif.data.volume import Volume
 from nerif.data.volume_sequence import VolumeSequence
 from nerif.geometry import Grid
 from nerif.physics.quantities import GasSettings, derive

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from nerif.common.conventions import InputError, with_unit
-from nerif.data.volume import field_of
+from nerif.data.quantity_names import field_of
 from nerif.data.volume_sequence import StoredViewScores, VolumeSequence
 from nerif.forward.registry import technique, technique_of
 from nerif.plotting.drawing import plain

@@ -14,7 +14,7 @@ from nerif.analysis.evaluation import rms_with_unit
 from nerif.analysis.remedies import WITHHOLD, Remedy, advice, likely_cause, longer
 from nerif.analysis.verdict import correlated_share, cut_off, time_of_fit, verdict
 from nerif.common.conventions import percent, with_unit
-from nerif.data.volume import INDEX, field_of, name_of
+from nerif.data.quantity_names import INDEX, field_of, name_of
 from nerif.forward.registry import TECHNIQUES
 from nerif.geometry.symmetry import Axis
 from nerif.physics.quantities import GasChanges

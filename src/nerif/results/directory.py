@@ -22,9 +22,10 @@ from nerif.common.written_files import WARN, WRITTEN, OwnFiles, remove_empty
 from nerif.data.kinds import RESULT, RUN, check_kind
 from nerif.data.measurement import Measurement
 from nerif.data.meridian import Meridian
+from nerif.data.quantity_names import INDEX, field_of
 from nerif.data.reprojection import Reprojection
 from nerif.data.surface import SurfaceMap
-from nerif.data.volume import INDEX, Volume, export, field_of
+from nerif.data.volume import Volume, export
 from nerif.data.volume_file import read_volume, read_volumes
 from nerif.fields.field import Field
 from nerif.geometry import Box, Grid

@@ -26,11 +26,13 @@ from nerif.common.npz import open_npz
 from nerif.common.written_files import WARN, OwnFiles
 from nerif.data.measurement import Measurement
 from nerif.data.measurement_data import Observation
-from nerif.data.volume import Volume, describe
+from nerif.data.quantity_names import describe
+from nerif.data.volume import Volume
 from nerif.fields.field import Field
 from nerif.forward.forward_model import ForwardModel
+from nerif.forward.model_names import AUTO
 from nerif.forward.path_integral import PathIntegral, project
-from nerif.forward.registry import AUTO, forward_model
+from nerif.forward.registry import forward_model
 from nerif.geometry import Box, Grid
 from nerif.reconstruction.progress import Monitor
 from nerif.reconstruction.reconstructor import OnStep, Reconstructor, Step, compose, sampled

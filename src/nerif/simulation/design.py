@@ -9,12 +9,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-import torch
-
 from nerif.common.conventions import InputError
 from nerif.common.settings import Positive, check_settings
-from nerif.geometry import Ring
-from nerif.physics.gas_optics import ambient_index
+from nerif.geometry.rig import Ring
 
 __all__ = ["DesignSettings", "Expectation", "expect"]
 
@@ -57,6 +54,8 @@ class DesignSettings:
         """Largest difference of the index to the ambient, by the temperature if that is set."""
         if self.temperature is None:
             return self.index_contrast
+        from nerif.physics.gas_optics import ambient_index
+
         flow, ambient = (
             ambient_index("air", t, self.pressure_pa, self.wavelength_nm)
             for t in (self.temperature, self.ambient_temperature)
@@ -92,6 +91,8 @@ def expect(ring: Ring, flow: DesignSettings) -> Expectation:
     size; by a layer of thickness a, edge-on over a length L, it is dn L / a. The displacement is the deflection times
     the lever arm and the sensitivity S of the forward model (docs/conventions.md).
     """
+    import torch
+
     camera = ring.cameras()[0]
     height, width = camera.image_size
     middle = torch.tensor([[(width - 1) / 2, (height - 1) / 2]], dtype=torch.float64)

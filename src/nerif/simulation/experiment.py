@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +25,8 @@ from nerif.geometry import Box, Camera, Grid
 from nerif.imaging.calibration.bundle import Pose
 from nerif.imaging.calibration.targets import CalibrationTarget
 from nerif.imaging.patterns import Background
-from nerif.simulation.rendering import Sensor, Texture, background_texture, pattern_size, render
+from nerif.simulation.experiment_settings import ExperimentSettings
+from nerif.simulation.rendering import Texture, background_texture, pattern_size, render
 
 __all__ = ["Experiment", "background_poses", "background_scale", "place", "side_of_one", "target_poses", "world_axes"]
 
@@ -43,33 +44,8 @@ KINDS = ("target", "background", "reference", "flow")
 ORIGIN = torch.zeros(3, dtype=torch.float64)
 
 
-@dataclass(frozen=True)
-class Experiment:
-    """Settings of the images."""
-
-    kind: str = "dots"
-    """Background: dots, wavelet or multiscale."""
-    dot: float = 3.0
-    """Size of a dot in the image, px."""
-    references: int = 5
-    """Images without flow."""
-    sensor: Sensor = field(default_factory=Sensor)
-    samples: int = 3
-    """Points along each edge of a pixel."""
-    target: str = "chessboard"
-    """Calibration target: chessboard, charuco or circles."""
-    columns: int = 10
-    """Squares (dots of circles) of the target along a row."""
-    rows: int = 7
-    """Squares along a column."""
-    pitch: float = 0.0
-    """Edge of a square, mm; 0 fills about 60 % of the image at the origin."""
-    poses: int = 30
-    """Poses of the target free in space; 0 for no calibration images."""
-    backgrounds: int = 5
-    """Images of the target on each background."""
-    seed: int = 0
-    """Seed of patterns, poses and noise."""
+class Experiment(ExperimentSettings):
+    """The images of an experiment."""
 
     def write(
         self, folder: Path, cameras: Sequence[Camera], phantom: Field, box: Box, n_ambient: float,

@@ -7,23 +7,19 @@ is the mean of the texture at X. Without a field the same rays are straight: the
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Annotated
 
-import numpy as np
 import torch
-from annotated_types import Ge, Le
 from jaxtyping import Float
 from torch import Tensor
 
 from nerif.common.arrays import Points
 from nerif.common.conventions import InputError
-from nerif.common.settings import NonNegative, Positive, check_settings
 from nerif.fields.field import Field
 from nerif.forward.ray_tracing import trace
 from nerif.geometry import Box, Camera, Lens, Plane, Rays
 from nerif.simulation.simulate import STEPS
 
-__all__ = ["Sensor", "Texture", "background_texture", "pattern_size", "render"]
+__all__ = ["Texture", "background_texture", "pattern_size", "render"]
 
 
 @dataclass(frozen=True)
@@ -71,33 +67,6 @@ class Texture:
             (self.values - self.surround)[None, None].to(grid), grid.reshape(1, 1, -1, 2), align_corners=False
         )
         return flat.reshape(column.shape) + self.surround
-
-
-@dataclass(frozen=True)
-class Sensor:
-    """A sensor: photons to counts."""
-
-    bits: Annotated[int, Ge(8), Le(16)] = 12
-    """Bits of the counts, 8 to 16."""
-    exposure: Positive = 0.8
-    """Share of full scale of white paper."""
-    full_well: NonNegative = 10000.0
-    """Electrons at full scale, which determine the shot noise (0: none)."""
-    read_noise: NonNegative = 10.0
-    """Standard deviation of the read noise, electrons."""
-
-    def __post_init__(self) -> None:
-        check_settings(self)
-
-    def expose(self, light: Float[Tensor, "row column"], seed: int) -> np.ndarray:
-        """Return counts of light from 0 (black) to 1 (white paper): shot noise, read noise, rounding, saturation."""
-        rng = np.random.default_rng(seed)
-        share = self.exposure * light.clamp_min(0).numpy()
-        if self.full_well > 0:
-            electrons = rng.poisson(share * self.full_well) + self.read_noise * rng.standard_normal(share.shape)
-            share = electrons / self.full_well
-        counts = np.clip(np.round(share * (2**self.bits - 1)), 0, 2**self.bits - 1)
-        return counts.astype(np.uint8 if self.bits == 8 else np.uint16)
 
 
 def background_texture(camera: Camera, values: Float[Tensor, "row column"], texel: float) -> Texture:

@@ -23,12 +23,10 @@ from nerif.reconstruction.voxels.symmetry_axis import axis_of, check_views, with
 from nerif.results.directory import ResultDirectory
 from nerif.results.metrics_file import WithheldRun
 from nerif.workflow.checkpointed import CheckpointedRun
+from nerif.workflow.run_settings import AUTO, NONE
 
-__all__ = ["AUTO", "MIN_VIEWS", "NONE", "CrossValidation", "ShortFit", "with_halves", "withheld_views"]
+__all__ = ["MIN_VIEWS", "CrossValidation", "ShortFit", "with_halves", "withheld_views"]
 
-AUTO: tuple[str, ...] = ("auto",)
-NONE: tuple[str, ...] = ("none",)
-"""Values of `withhold` other than names of views: cross-validation with one view, and no withheld view."""
 MIN_VIEWS = 4  # with three, the other two constrain the field too little
 LIMITS = ("epochs", "max_steps", "iterations")
 SCORES = "views.json"

@@ -24,8 +24,9 @@ from nerif.common.settings import with_present_names
 from nerif.common.times import check_interval, interval, same_instants
 from nerif.data.kinds import SEQUENCE, kind_of
 from nerif.data.measurement_sequence import MeasurementSequence, check_store
+from nerif.data.quantity_names import INDEX
 from nerif.data.velocity_sequence import VelocitySequence
-from nerif.data.volume import COMPONENTS, INDEX
+from nerif.data.volume import COMPONENTS
 from nerif.data.volume_sequence import FIELDS, VolumeSequence
 from nerif.flow.assimilation import FitIterate, FitState, VelocityFit
 from nerif.flow.box_domain import BoxDomain, section_of

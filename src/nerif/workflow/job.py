@@ -5,11 +5,9 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
-
-from annotated_types import Ge
+from typing import Any
 
 from nerif.analysis.asymmetry import halved
 from nerif.analysis.gains import fit_gains, with_gains
@@ -17,12 +15,12 @@ from nerif.analysis.prediction import check_sees
 from nerif.common.conventions import InputError, percent
 from nerif.common.installation import command_line, word_of
 from nerif.common.memory import free_memory
-from nerif.common.settings import NonNegative, check_settings, with_present_names
+from nerif.common.settings import with_present_names
 from nerif.data.measurement import Measurement
-from nerif.data.volume import Volume, quantities_of
+from nerif.data.quantity_names import quantities_of
+from nerif.data.volume import Volume
 from nerif.fields.field import Field
 from nerif.geometry import Box, Grid
-from nerif.physics.quantities import GasSettings
 from nerif.reconstruction.aperture import apply_aperture
 from nerif.reconstruction.detail.detail import DetailChoice, Posterior, check_sigma
 from nerif.reconstruction.field_files import CHECKPOINT, FIELD
@@ -34,52 +32,19 @@ from nerif.reconstruction.progress import QUIET, Monitor
 from nerif.reconstruction.reconstructor import VOXELS, OnStep, Reconstruction, Reconstructor, State, Step
 from nerif.reconstruction.shared_settings import SharedSettings
 from nerif.reconstruction.sources import check_source
-from nerif.reconstruction.uncertainty.bootstrap import KINDS, Trials
+from nerif.reconstruction.uncertainty.bootstrap import Trials
 from nerif.reconstruction.uncertainty.rig_posterior import RigPosterior
 from nerif.reconstruction.voxels.symmetry_axis import axis_of, too_few_views, with_axis
 from nerif.results.directory import ResultDirectory
 from nerif.results.live import Live
 from nerif.results.metrics_file import DetailEntries
 from nerif.workflow.budget import Budget
-from nerif.workflow.cross_validation import AUTO, MIN_VIEWS, CrossValidation, with_halves
+from nerif.workflow.cross_validation import MIN_VIEWS, CrossValidation, with_halves
+from nerif.workflow.run_settings import AUTO, Run
 
-__all__ = ["Inputs", "Job", "Run", "remedy"]
+__all__ = ["Inputs", "Job", "remedy"]
 
 VOLUMES = 4  # written quantities, in double precision while they are derived
-
-
-@dataclass(frozen=True)
-class Run:
-    """Settings of a reconstruction into a directory, in addition to those of the method."""
-
-    withhold: tuple[str, ...] = AUTO
-    """Withheld views for cross-validation: names; left or right (half of each image of an axisymmetric flow); auto (one
-    view, in a short run from which the run with all views starts); or none."""
-    start_from: Path | None = None
-    """Result directory with the initial field: a reconstruction by any method in the same box."""
-    extend_open_faces: NonNegative = 0.0
-    """Millimetres by which the box grows through the open faces (--open-faces) while the field is solved for: rays
-    through them are kept. The result is that of the box alone (0: rays through open faces are left out)."""
-    fit_gains: bool = False
-    """For emission: fit the intensity gain of each camera (not of withheld views)."""
-    detail: Literal["auto", "on", "off"] = "auto"
-    """Add detail that the field leaves in its data (docs/detail.md): on, off, or auto (for nerif and tv, where the
-    residual is above the noise and the withheld view of the cross-validation is predicted better with it)."""
-    uncertainty: Literal[*KINDS] = "off"  # type: ignore[valid-type]
-    """Standard deviations of every quantity: off, fast (2 samples of the error) or full (8 samples); draws from the
-    posterior where detail is added, else bootstrap trials."""
-    report: bool = True
-    """Write report.html at the end."""
-    checkpoint_every: float = 60.0
-    """Interval between checkpoints in seconds."""
-    threads: Annotated[int, Ge(0)] = 0
-    """Threads on a CPU (0: as many as there are free cores). With a fixed number, runs without a time limit have the
-    same result to the last digit."""
-    gas: GasSettings = field(default_factory=GasSettings)
-    """Gas for density and temperature."""
-
-    def __post_init__(self) -> None:
-        check_settings(self)
 
 
 def remedy(out: ResultDirectory, own_files: bool) -> str:

@@ -17,7 +17,8 @@ from nerif.reconstruction.neural.parallel import Ranks
 from nerif.reconstruction.progress import QUIET, Monitor
 from nerif.reconstruction.reconstructor import OnStep, Reconstruction, Reconstructor
 from nerif.results.directory import ResultDirectory
-from nerif.workflow.job import Job, Run, remedy
+from nerif.workflow.job import Job, remedy
+from nerif.workflow.run_settings import Run
 from nerif.workflow.steps import CLOSING, STEPS, Fit, the_result
 
 __all__ = ["reconstruct_into"]

@@ -24,7 +24,7 @@ from nerif.common.conventions import unit_shown
 from nerif.common.installation import word_of
 from nerif.data.cameras_file import CalibratedCamera, write_cameras
 from nerif.data.measurement import Measurement
-from nerif.data.volume import describe
+from nerif.data.quantity_names import describe
 from nerif.geometry import Grid
 from nerif.physics.quantities import masked_lines
 from nerif.reconstruction.detail.detail import COARSE, EARLY, ITERATIONS, SIGNIFICANT, Detail, DetailChoice, choose

@@ -25,7 +25,7 @@ from nerif.fields.phantoms import Flame
 from nerif.geometry import Box, Grid, Ring
 from nerif.report.movie import Movie
 from nerif.report.sequence_page import render_sequence
-from nerif.simulation.simulate import Simulation
+from nerif.simulation.simulation import Simulation
 from nerif.workflow.sequence.chunk import finished_frame
 from nerif.workflow.sequence.plan import SequencePlan, SequenceSettings
 from nerif.workflow.sequence.run import outcome_table

@@ -22,8 +22,8 @@ from nerif.common.conventions import InputError
 from nerif.common.files import read_toml
 from nerif.common.installation import word_of
 from nerif.common.settings import MISSING, merge
+from nerif.imaging.calibration.calibration_settings import SimpleRig
 from nerif.imaging.calibration.result import ImageError
-from nerif.imaging.calibration.simple_rig import SimpleRig
 from nerif.imaging.calibration.targets import CalibrationTarget
 from nerif.imaging.readers.views import View
 

@@ -17,7 +17,7 @@ from nerif.app.views.result_volumes import film_progress
 from nerif.app.views.surfaces import LiveSurface, caption_of
 from nerif.common.conventions import unit_shown
 from nerif.common.files import ending
-from nerif.data.volume import name_of
+from nerif.data.quantity_names import name_of
 from nerif.geometry import Box
 from nerif.plotting.drawing import colour_range, map_range
 from nerif.report.slice_images import slice_axes

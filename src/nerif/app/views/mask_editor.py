@@ -20,7 +20,8 @@ from nerif.app.views.edits import Edits, UndoButtons
 from nerif.app.views.view_maps import magnitude_address, threshold_address
 from nerif.cli.commands.mask import Mask
 from nerif.data.measurement import Measurement
-from nerif.imaging.masks import MaskSettings, MaskShape, write_masks
+from nerif.imaging.imaging_settings import MaskSettings
+from nerif.imaging.masks import MaskShape, write_masks
 
 __all__ = ["MaskCard"]
 

@@ -20,7 +20,8 @@ from nerif.app.views.slices_view import Panel, SlicesView
 from nerif.app.views.surfaces import Surface, SurfaceView
 from nerif.common.conventions import InputError, unit_shown
 from nerif.common.files import ending
-from nerif.data.volume import Volume, describe
+from nerif.data.quantity_names import describe
+from nerif.data.volume import Volume
 from nerif.plotting.drawing import DIVERGING, LABELS, map_range
 from nerif.report.slice_images import colours_of
 from nerif.results.directory import SURFACE, VOLUME

@@ -9,8 +9,9 @@ from typing import Protocol
 
 from nerif.common.conventions import STATISTICS, InputError
 from nerif.common.files import ending
+from nerif.data.quantity_names import INDEX
 from nerif.data.velocity_sequence import open_volumes
-from nerif.data.volume import INDEX, Volume
+from nerif.data.volume import Volume
 from nerif.data.volume_file import read_volumes
 from nerif.plotting.drawing import colour_range, plotted_values
 from nerif.report.isosurface import default_level

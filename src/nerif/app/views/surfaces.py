@@ -13,7 +13,7 @@ from nicegui import ui
 from nerif.app.forms.sliders import RangeSlider
 from nerif.app.views.routes import bodies_address, live_address, surface_address
 from nerif.common.conventions import unit_shown
-from nerif.data.volume import describe, name_of
+from nerif.data.quantity_names import describe, name_of
 from nerif.geometry import Box
 from nerif.report.isosurface import default_level, surface_triangles
 from nerif.results.live import LiveSnapshot

@@ -10,7 +10,8 @@ from nerif.app.forms.elements import images_html
 from nerif.data.measurement import Measurement
 from nerif.data.measurement_data import integrals_of
 from nerif.geometry import Camera
-from nerif.imaging.masks import MaskSettings, with_flow_masks
+from nerif.imaging.imaging_settings import MaskSettings
+from nerif.imaging.masks import with_flow_masks
 from nerif.report.view_images import image_address
 
 __all__ = ["magnitude_address", "maps_html", "threshold_address"]

@@ -5,9 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
-import torch
 from annotated_types import Ge
 
 from nerif.cli.arguments import check_output
@@ -16,14 +15,10 @@ from nerif.cli.settings import Settings, command
 from nerif.common.conventions import InputError
 from nerif.common.locks import locked
 from nerif.common.settings import Positional
-from nerif.data.body_file import read_body
-from nerif.data.measurement import Measurement
-from nerif.data.measurement_sequence import MeasurementSequence
-from nerif.geometry.body import Body
-from nerif.geometry.pose import rotation_matrix
-from nerif.imaging.bodies import check_size, film_with_bodies, read_poses, with_bodies, without_bodies
-from nerif.imaging.masks import drawn_masks
-from nerif.imaging.silhouettes import drawn_silhouettes, hull_of_silhouettes, refine_pose
+
+if TYPE_CHECKING:
+    from nerif.data.measurement import Measurement
+    from nerif.geometry.body import Body
 
 __all__ = ["BodyInFlow", "main", "run"]
 
@@ -67,6 +62,10 @@ class BodyInFlow(Settings):
 
 def run(settings: BodyInFlow) -> Measurement:
     """Write the measurement with its bodies."""
+    from nerif.data.measurement import Measurement
+    from nerif.data.measurement_sequence import MeasurementSequence
+    from nerif.imaging.bodies import with_bodies, without_bodies
+
     out, film = settings.out, settings.measurement.suffix == ".zarr"
     ending = ".zarr" if film else ".nc"
     if out is None:
@@ -128,6 +127,14 @@ def _check(settings: BodyInFlow, film: bool) -> None:
 
 def _bodies(settings: BodyInFlow, measurement: Measurement) -> list[Body]:
     """The bodies of the files at their pose, or that of the silhouettes."""
+    import torch
+
+    from nerif.data.body_file import read_body
+    from nerif.geometry.pose import rotation_matrix
+    from nerif.imaging.bodies import check_size
+    from nerif.imaging.masks import drawn_masks
+    from nerif.imaging.silhouettes import drawn_silhouettes, hull_of_silhouettes, refine_pose
+
     silhouettes = None
     if settings.silhouettes is not None:
         silhouettes = drawn_silhouettes(
@@ -153,6 +160,9 @@ def _bodies(settings: BodyInFlow, measurement: Measurement) -> list[Body]:
 
 def _film(settings: BodyInFlow, bodies: list[Body], out: Path) -> Measurement:
     """Write the film with its bodies, and return its first complete frame."""
+    from nerif.data.measurement_sequence import MeasurementSequence
+    from nerif.imaging.bodies import film_with_bodies, read_poses
+
     film = MeasurementSequence.read(settings.measurement)
     poses = None if settings.poses is None else read_poses(settings.poses, len(bodies), len(film))
     stated = settings.unit is not None

@@ -6,9 +6,7 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated
-
-import torch
+from typing import TYPE_CHECKING, Annotated
 
 from nerif.cli.arguments import check_output
 from nerif.cli.output import counting_bar, say
@@ -16,15 +14,13 @@ from nerif.cli.settings import Settings, command
 from nerif.common.conventions import InputError
 from nerif.common.files import ending
 from nerif.common.settings import Flat, Positional
-from nerif.data.cameras_file import CalibratedCamera, write_cameras
-from nerif.data.measurement import Measurement
-from nerif.geometry import Box, Camera
-from nerif.imaging.calibration.calibrate import CalibrationSettings, calibrate_views, target_images
-from nerif.imaging.calibration.importers.importers import ImportSettings, import_box, import_cameras, is_calibration
-from nerif.imaging.calibration.result import MOUNT, Calibration
-from nerif.imaging.calibration.simple_rig import SimpleRig, box_about_axis, find_image, simple_camera
+from nerif.imaging.calibration.calibration_settings import CalibrationSettings, ImportSettings, SimpleRig
 from nerif.imaging.calibration.targets import CalibrationTarget
-from nerif.imaging.readers.views import find_views
+
+if TYPE_CHECKING:
+    from nerif.data.cameras_file import CalibratedCamera
+    from nerif.geometry import Box, Camera
+    from nerif.imaging.calibration.result import Calibration
 
 __all__ = ["Calibrate", "main", "run"]
 
@@ -69,6 +65,11 @@ class Calibrate(Settings):
 
 def run(settings: Calibrate) -> None:
     """Write the calibration and its figures."""
+    from nerif.data.cameras_file import write_cameras
+    from nerif.geometry import Box
+    from nerif.imaging.calibration.importers.importers import import_box, import_cameras, is_calibration
+    from nerif.imaging.calibration.result import MOUNT
+
     box = Box.between(settings.lower, settings.upper)
     if settings.simple and not settings.method.kind.shows_depth:
         raise InputError(f"expected perspective with --simple, got {settings.method.projection}", field="projection")
@@ -111,6 +112,8 @@ def run(settings: Calibrate) -> None:
 
 
 def _simple(settings: Calibrate, box: Box | None) -> tuple[CalibratedCamera, Box]:
+    from nerif.imaging.calibration.simple_rig import box_about_axis, find_image, simple_camera
+
     name, size = find_image(settings.source, settings.views, settings.taken_over.image_size)
     camera = simple_camera(settings.rig, size, settings.taken_over, name)
     return camera, box or box_about_axis(camera)
@@ -118,6 +121,9 @@ def _simple(settings: Calibrate, box: Box | None) -> tuple[CalibratedCamera, Box
 
 def _cameras(settings: Calibrate, box: Box | None) -> tuple[Sequence[CalibratedCamera] | Sequence[Camera], Box | None]:
     """Return the cameras to draw with --check, and the box."""
+    from nerif.data.measurement import Measurement
+    from nerif.imaging.calibration.importers.importers import import_box, import_cameras
+
     if settings.simple:
         camera, box = _simple(settings, box)
         return (camera,), box
@@ -129,6 +135,8 @@ def _cameras(settings: Calibrate, box: Box | None) -> tuple[Sequence[CalibratedC
 
 
 def _print_simple(out: Path, camera: CalibratedCamera, box: Box) -> None:
+    import torch
+
     complete = camera.camera()
     scale = float(complete.pixel_size(torch.zeros(3, dtype=torch.float64)))
     edges = ", ".join(f"{axis} {a:g} to {b:g}" for axis, a, b in zip("xyz", box.lower, box.upper, strict=True))
@@ -141,6 +149,9 @@ def _print_simple(out: Path, camera: CalibratedCamera, box: Box) -> None:
 
 
 def _calibrate(settings: Calibrate) -> Calibration:
+    from nerif.imaging.calibration.calibrate import calibrate_views, target_images
+    from nerif.imaging.readers.views import find_views
+
     views, count = find_views(settings.source, settings.views), itertools.count(1)
     with counting_bar("detecting targets", target_images(views)) as bar:
         return calibrate_views(
@@ -174,6 +185,7 @@ def _print(calibration: Calibration) -> None:
 
 
 def _draw(path: Path, cameras: Sequence[CalibratedCamera] | Sequence[Camera], box: Box | None) -> None:
+    from nerif.geometry import Camera
     from nerif.report.rig_figure import save_rig
 
     complete: list[Camera] = []

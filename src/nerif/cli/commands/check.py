@@ -4,23 +4,23 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from annotated_types import Ge
 
-from nerif.analysis.consistency import Consistency, check_consistency, corrected
-from nerif.analysis.consistency_file import CheckFindings, read_findings, write_findings
-from nerif.analysis.film_check import check_film
-from nerif.analysis.rig_check import RigCheck, check_rig
 from nerif.cli.arguments import check_output
 from nerif.cli.output import MONITOR, counting_bar, say
-from nerif.cli.settings import Settings
+from nerif.cli.settings import Settings, compute
 from nerif.common.conventions import InputError
 from nerif.common.files import ending
 from nerif.common.settings import Positional, Positive
-from nerif.data.measurement import Measurement
-from nerif.data.measurement_sequence import MeasurementSequence
 from nerif.reconstruction.shared_settings import Aperture
+
+if TYPE_CHECKING:
+    from nerif.analysis.consistency import Consistency
+    from nerif.analysis.rig_check import RigCheck
+    from nerif.data.measurement import Measurement
+    from nerif.data.measurement_sequence import MeasurementSequence
 
 __all__ = ["Check", "main", "run"]
 
@@ -65,6 +65,12 @@ class Check(Settings):
 
 def run(settings: Check) -> Consistency | RigCheck:
     """Compare the views, or refine their cameras, and print the result."""
+    from nerif.analysis.consistency import Consistency, corrected
+    from nerif.analysis.consistency_file import CheckFindings, write_findings
+    from nerif.analysis.rig_check import RigCheck
+    from nerif.data.measurement import Measurement
+    from nerif.data.measurement_sequence import MeasurementSequence
+
     if settings.out is not None:
         if settings.refine:
             raise InputError("expected none with --refine, which corrects nothing; leave one out", field="out")
@@ -109,6 +115,8 @@ def _check_findings_file(path: Path, settings: Check) -> None:
 
 def _is_earlier(path: Path, measurement: Path) -> bool:
     """Whether a file holds earlier findings of this measurement."""
+    from nerif.analysis.consistency_file import read_findings
+
     try:
         return read_findings(path).measurement == str(measurement)
     except (InputError, OSError):
@@ -116,6 +124,8 @@ def _is_earlier(path: Path, measurement: Path) -> bool:
 
 
 def _rig(settings: Check, measurement: Measurement) -> RigCheck:
+    from nerif.analysis.rig_check import check_rig
+
     sigma = (settings.pose_sigma_mm, settings.pose_sigma_deg)
     result = check_rig(measurement, settings.refine, settings.time_limit, *sigma, MONITOR, settings.aperture)
     heads = ("change [sigma]", "shift [px]", "+- [px]", "less uncertain", "residual [sigma]")
@@ -129,6 +139,10 @@ def _rig(settings: Check, measurement: Measurement) -> RigCheck:
 
 
 def _views(settings: Check, measurement: Measurement | MeasurementSequence) -> Consistency:
+    from nerif.analysis.consistency import check_consistency
+    from nerif.analysis.film_check import check_film
+    from nerif.data.measurement_sequence import MeasurementSequence
+
     with counting_bar("comparing views") as bar:
         if isinstance(measurement, MeasurementSequence):
             result = check_film(measurement, settings.voxels, bar, settings.aperture)
@@ -146,5 +160,5 @@ def _views(settings: Check, measurement: Measurement | MeasurementSequence) -> C
 def main(arguments: list[str]) -> None:
     """Parse and run."""
     settings = Check.read(arguments, "check")
-    if run(settings).findings and settings.strict:
+    if compute(run, settings).findings and settings.strict:
         raise SystemExit(1)

@@ -18,7 +18,6 @@ from nerif.common.installation import command_line, install
 from nerif.common.settings import Positional
 from nerif.common.written_files import OwnFiles
 from nerif.data.samples import SAMPLES, sample
-from nerif.results.directory import REPORT, ResultDirectory
 
 __all__ = ["DEMOS", "Demo", "main", "run"]
 
@@ -121,6 +120,8 @@ class Demo(Settings):
 
 def run(settings: Demo) -> None:
     """Run the commands of a demo, and print where the report is and what to try next."""
+    from nerif.results.directory import REPORT, ResultDirectory
+
     if settings.list:
         for name, demo in DEMOS.items():
             say(f"nerif demo {name:<10} {demo.title}")
@@ -144,6 +145,8 @@ def run(settings: Demo) -> None:
 
 
 def _print_next(name: str, out: Path) -> None:
+    from nerif.results.directory import REPORT
+
     other = "flame" if name == "jet" else "jet"
     commands = {
         command_line(["figures", str(out)]): "figures for print, as PDF and PNG",

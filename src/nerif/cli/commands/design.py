@@ -10,9 +10,7 @@ from nerif.cli.arguments import check_output
 from nerif.cli.output import say
 from nerif.cli.settings import Settings, command
 from nerif.common.settings import Flat
-from nerif.data.body_file import read_body
-from nerif.geometry import Ring
-from nerif.geometry.body import hidden_pixels
+from nerif.geometry.rig import Ring
 from nerif.simulation.design import DesignSettings, Expectation, expect
 
 __all__ = ["Design", "main", "run"]
@@ -36,6 +34,9 @@ class Design(Settings):
 
 def run(settings: Design) -> Expectation:
     """Print the prediction, and draw it."""
+    from nerif.data.body_file import read_body
+    from nerif.geometry.body import hidden_pixels
+
     if settings.out is not None:
         check_output(settings.out, settings.force, endings=(".png", ".pdf"))
     body = None if settings.body is None else read_body(settings.body, settings.unit, lambda line: say(f"note: {line}"))

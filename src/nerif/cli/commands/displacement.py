@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from annotated_types import Ge
 
@@ -16,16 +16,12 @@ from nerif.common.conventions import InputError
 from nerif.common.interruption import if_interrupted
 from nerif.common.locks import locked
 from nerif.common.settings import Count, Flat, NonNegative, Positional
-from nerif.data.measurement import Measurement
-from nerif.data.measurement_sequence import MeasurementSequence
-from nerif.data.measurement_summary import valid_pixels
-from nerif.forward.deflection import Deflection
-from nerif.geometry import Box
-from nerif.imaging.displacement.displacement import DisplacementSettings
-from nerif.imaging.masks import MaskSettings
-from nerif.imaging.readers.views import find_views
-from nerif.imaging.recording import Recording, Scene, Surroundings, measure_instant
-from nerif.imaging.recording_sequence import frame_numbers, instants_of, measure_recording
+from nerif.imaging.imaging_settings import DisplacementSettings, MaskSettings, Surroundings
+
+if TYPE_CHECKING:
+    from nerif.data.measurement import Measurement
+    from nerif.data.measurement_sequence import MeasurementSequence
+    from nerif.imaging.recording import Recording
 
 __all__ = ["Displacement", "main", "run"]
 
@@ -79,8 +75,11 @@ class Displacement(Settings):
 
     def recording(self) -> Recording:
         """Return images, cameras and box."""
+        from nerif.geometry import Box
         from nerif.imaging.calibration.importers.importers import import_box, import_cameras
         from nerif.imaging.calibration.importers.names import cameras_by_view
+        from nerif.imaging.readers.views import find_views
+        from nerif.imaging.recording import Recording, Scene
 
         views = find_views(self.folder, self.views, self.frame_offset)
         everything = [view.name for view in find_views(self.folder)]
@@ -99,6 +98,8 @@ class Displacement(Settings):
 
 def run(settings: Displacement) -> Measurement:
     """Write the measurement, or a sequence, of which a complete frame is returned."""
+    from nerif.imaging.recording import measure_instant
+
     image = settings.out.with_suffix(".png")
     if settings.frames:  # a sequence that exists is continued
         check_output(settings.out, True, endings=(".zarr",))
@@ -122,6 +123,8 @@ def run(settings: Displacement) -> Measurement:
 
 
 def _run_over_time(settings: Displacement, recording: Recording) -> MeasurementSequence:
+    from nerif.imaging.recording_sequence import frame_numbers, instants_of, measure_recording
+
     if settings.average != 1 or settings.frame != 0:
         raise InputError("expected none with --frames, which selects the flow images", field="frame, average")
     numbers = frame_numbers(settings.frames, recording.views)
@@ -135,6 +138,9 @@ def _run_over_time(settings: Displacement, recording: Recording) -> MeasurementS
 
 
 def _print(measurement: Measurement, noise: Mapping[str, str]) -> None:
+    from nerif.data.measurement_summary import valid_pixels
+    from nerif.forward.deflection import Deflection
+
     say(f"{'view':<12}{'valid':>8}{'rms d [px]':>12}{'max |d| [px]':>14}{'sigma [px]':>12}  noise from")
     assert measurement.sigma is not None
     (deflection,) = (o for o in measurement.observations if o.technique is Deflection)

@@ -5,16 +5,17 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from nerif.analysis.evaluation import FLOW, evaluate, rms_with_unit
 from nerif.cli.output import counting_bar, say
 from nerif.cli.settings import Settings, command
 from nerif.common.conventions import InputError
 from nerif.common.files import ending
 from nerif.common.settings import Positional
-from nerif.data.volume import INDEX, name_of
-from nerif.results.metrics_file import ViewScores
+from nerif.data.quantity_names import INDEX, name_of
+
+if TYPE_CHECKING:
+    from nerif.results.metrics_file import ViewScores
 
 __all__ = ["Evaluate", "main", "run"]
 
@@ -37,6 +38,8 @@ class Evaluate(Settings):
 
 def run(settings: Evaluate) -> dict[str, Any]:
     """Print the metrics and return them."""
+    from nerif.analysis.evaluation import evaluate
+
     if ending(settings.result) == ".zarr":
         return _run_over_time(settings)
     with counting_bar("re-projecting") as bar:
@@ -51,6 +54,8 @@ def run(settings: Evaluate) -> dict[str, Any]:
 
 
 def _print_volume(metrics: dict[str, Any]) -> None:
+    from nerif.analysis.evaluation import FLOW
+
     if "coverage" in metrics:
         coverage = metrics["coverage"]
         one, two = coverage["one_sigma_in_flow"], coverage["two_sigma_in_flow"]
@@ -77,6 +82,8 @@ def _print_volume(metrics: dict[str, Any]) -> None:
 
 
 def _print_views(views: list[ViewScores]) -> None:
+    from nerif.analysis.evaluation import rms_with_unit
+
     several = len({v["measured"] for v in views}) > 1
     say(f"view          {' ' * 14 * several}      CC    SSIM  PSNR [dB]  rms")
     for v in views:

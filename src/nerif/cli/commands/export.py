@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from nerif.cli.arguments import check_output
 from nerif.cli.output import counting_bar, say
@@ -12,13 +12,11 @@ from nerif.cli.settings import Settings, command
 from nerif.common.conventions import InputError
 from nerif.common.files import ending
 from nerif.common.settings import Positional
-from nerif.data.geometry_export import PROGRAMS, export_geometry
-from nerif.data.measurement import Measurement
-from nerif.data.velocity_sequence import export_frame
-from nerif.data.volume import FORMATS, export, quantities_of
-from nerif.geometry import Box, Grid
+from nerif.data.quantity_names import quantities_of
 from nerif.physics.quantities import GasChanges, derive, masked_lines
-from nerif.results.directory import ResultDirectory
+
+if TYPE_CHECKING:
+    from nerif.geometry import Box, Grid
 
 __all__ = ["Export", "main", "run"]
 
@@ -34,7 +32,7 @@ class Export(Settings):
     """Result directory of nerif reconstruct, or volumes over time (.zarr); for astra and tigre a measurement (.nc)."""
     out: Path
     """Output file; format by its ending: .vti, .nc, .npz, .mat or .csv; for astra and tigre .npz."""
-    format: Literal["field", *PROGRAMS] = "field"  # type: ignore[valid-type]
+    format: Literal["field", "astra", "tigre"] = "field"
     """What to write: the field, or cameras and grid for astra or tigre."""
     quantities: tuple[str, ...] = ()
     """Quantities to write; of an index index_excess (1), n (1), density (kg/m3), temperature (K) (default: all but
@@ -57,6 +55,12 @@ class Export(Settings):
 
 def run(settings: Export) -> None:
     """Write the file."""
+    from nerif.data.geometry_export import export_geometry
+    from nerif.data.measurement import Measurement
+    from nerif.data.velocity_sequence import export_frame
+    from nerif.data.volume import FORMATS, export
+    from nerif.results.directory import ResultDirectory
+
     check_output(settings.out, settings.force, endings=tuple(FORMATS) if settings.format == "field" else (".npz",))
     if settings.format != "field":
         if settings.quantities:
@@ -92,6 +96,8 @@ def run(settings: Export) -> None:
 
 def _grid(settings: Export, whole: Box) -> Grid:
     """Return the grid of the settings within a box."""
+    from nerif.geometry import Box, Grid
+
     box = Box(settings.lower or whole.lower, settings.upper or whole.upper)
     if not whole.holds(box):
         raise InputError(

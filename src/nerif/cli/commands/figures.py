@@ -12,8 +12,7 @@ from nerif.cli.output import counting_bar, say
 from nerif.cli.settings import Settings, command
 from nerif.common.conventions import InputError
 from nerif.common.settings import Positional
-from nerif.report.journal_figures import JOURNALS, save_figures
-from nerif.results.directory import FIGURES, ResultDirectory
+from nerif.report.journals import JOURNALS
 
 __all__ = ["Figures", "main", "run"]
 
@@ -34,6 +33,9 @@ class Figures(Settings):
 
 def run(settings: Figures) -> None:
     """Write the figures, and print what could not be drawn."""
+    from nerif.report.journal_figures import save_figures
+    from nerif.results.directory import FIGURES, ResultDirectory
+
     result = ResultDirectory(settings.result).read()
     out = settings.out or settings.result / FIGURES
     if out.is_file():

@@ -5,24 +5,21 @@ from __future__ import annotations
 import math
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
-import torch
-from torch import Tensor
-
-from nerif.analysis.evaluation import rms_with_unit
 from nerif.cli.output import say
 from nerif.cli.settings import Settings, command
 from nerif.common.conventions import percent, with_unit
 from nerif.common.settings import Positional
-from nerif.data.kinds import MEASUREMENT, RESULT, SEQUENCE, VOLUME, check_kind, kind_of
-from nerif.data.measurement import Measurement
-from nerif.data.measurement_sequence import MeasurementSequence
-from nerif.data.measurement_summary import valid_pixels
-from nerif.data.volume import INDEX, Volume, name_of
-from nerif.data.volume_file import read_volume
+from nerif.data.quantity_names import INDEX, name_of
 from nerif.plotting.notebook import number
-from nerif.results.directory import METRICS, ResultDirectory
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from nerif.data.measurement import Measurement
+    from nerif.data.measurement_sequence import MeasurementSequence
+    from nerif.data.volume import Volume
 
 __all__ = ["Info", "main", "run"]
 
@@ -37,6 +34,11 @@ class Info(Settings):
 
 def run(settings: Info) -> None:
     """Print the description."""
+    from nerif.data.kinds import MEASUREMENT, RESULT, SEQUENCE, VOLUME, check_kind, kind_of
+    from nerif.data.measurement import Measurement
+    from nerif.data.measurement_sequence import MeasurementSequence
+    from nerif.data.volume_file import read_volume
+
     path = settings.path
     check_kind(path, MEASUREMENT, VOLUME, RESULT, SEQUENCE)
     if kind_of(path) is SEQUENCE:
@@ -65,6 +67,10 @@ def _film(path: Path, film: MeasurementSequence) -> None:
 
 
 def _measurement(path: Path, m: Measurement) -> None:
+    import torch
+
+    from nerif.data.measurement_summary import valid_pixels
+
     say(f"{path}: measurement, {len(m.cameras)} views of {m.shape[1]} x {m.shape[2]} px")
     say(f"  box            {_corners(m.box.lower, m.box.upper)}")
     light = f", wavelength {m.wavelength_nm:g} nm" if m.wavelength_nm else ""
@@ -115,6 +121,8 @@ def _measurement(path: Path, m: Measurement) -> None:
 
 
 def _volume(path: Path, v: Volume) -> None:
+    import torch
+
     say(f"{path}: volume of {v.quantity} [{v.unit}] on {' x '.join(map(str, v.grid.shape))} voxels (z, y, x)")
     say(f"  box            {_corners(v.grid.box.lower, v.grid.box.upper)}")
     finite = v.values[v.values.isfinite()]
@@ -125,6 +133,9 @@ def _volume(path: Path, v: Volume) -> None:
 
 
 def _result(path: Path) -> None:
+    from nerif.analysis.evaluation import rms_with_unit
+    from nerif.results.directory import METRICS, ResultDirectory
+
     directory = ResultDirectory(path)
     _, box, n_ambient = directory.field()
     quantity = directory.quantity()

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from nerif.cli.arguments import check_output
 from nerif.cli.output import counting_bar, say
 from nerif.cli.settings import Settings, command
 from nerif.common.settings import Flat, Positional
-from nerif.data.measurement import Measurement
-from nerif.geometry import Grid
-from nerif.imaging.masks import MaskSettings, drawn_masks, with_flow_masks
-from nerif.reconstruction.gauge import visual_hull
+from nerif.imaging.imaging_settings import MaskSettings
+
+if TYPE_CHECKING:
+    from nerif.data.measurement import Measurement
 
 __all__ = ["Mask", "main", "run"]
 
@@ -42,6 +42,11 @@ class Mask(Settings):
 
 def run(settings: Mask) -> Measurement:
     """Write the measurement with its masks."""
+    from nerif.data.measurement import Measurement
+    from nerif.geometry import Grid
+    from nerif.imaging.masks import drawn_masks, with_flow_masks
+    from nerif.reconstruction.gauge import visual_hull
+
     image = settings.out.with_suffix(".masks.png")
     check_output(settings.out, settings.force, image, endings=(".nc",))
     measurement = Measurement.read(settings.measurement)

@@ -10,8 +10,7 @@ from nerif.cli.arguments import check_output
 from nerif.cli.output import counting_bar, say
 from nerif.cli.settings import Settings, command
 from nerif.common.settings import Count, Flat, Positional
-from nerif.data.velocity_sequence import open_volumes
-from nerif.report.movie import Movie, finished_frames
+from nerif.report.movie_settings import MovieSettings
 
 __all__ = ["MovieCommand", "main", "run"]
 
@@ -28,17 +27,20 @@ class MovieCommand(Settings):
     """Draw every Nth frame."""
     force: bool = False
     """Overwrite an existing file."""
-    look: Annotated[Movie, Flat] = field(default_factory=Movie)
+    look: Annotated[MovieSettings, Flat] = field(default_factory=MovieSettings)
 
 
 def run(settings: MovieCommand) -> None:
     """Write the movie."""
+    from nerif.data.velocity_sequence import open_volumes
+    from nerif.report.movie import Movie, finished_frames
+
     check_output(settings.out, settings.force)
     store = open_volumes(settings.result)
     complete = finished_frames(store)
     frames = complete[:: settings.every]
     with counting_bar("drawing frames", len(frames)) as bar:
-        settings.look.write(settings.out, store, frames, bar)
+        Movie(**vars(settings.look)).write(settings.out, store, frames, bar)
     say(f"{settings.out}: {len(frames)} frames, {len(frames) / settings.look.frames_per_second:.1f} s")
     if len(complete) < len(store):
         say(f"{len(store) - len(complete)} missing or failed frames were left out")

@@ -4,20 +4,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
-from nerif.analysis.prediction import predict
 from nerif.cli.arguments import check_output
 from nerif.cli.output import counting_bar, say
 from nerif.cli.settings import Settings, command
 from nerif.common.conventions import InputError, with_unit
 from nerif.common.settings import Flat, Positional
-from nerif.data.measurement import Measurement
-from nerif.forward.registry import AUTO, model_of, technique, technique_of
-from nerif.geometry import Ring
-from nerif.reconstruction.aperture import apply_aperture
+from nerif.forward.model_names import AUTO
+from nerif.geometry.rig import Ring
 from nerif.reconstruction.shared_settings import Aperture
-from nerif.results.directory import ResultDirectory
+
+if TYPE_CHECKING:
+    from nerif.data.measurement import Measurement
 
 __all__ = ["Project", "main", "run"]
 
@@ -53,6 +52,12 @@ class Project(Settings):
 
 def run(settings: Project) -> Measurement:
     """Write the predicted measurement and return it."""
+    from nerif.analysis.prediction import predict
+    from nerif.data.measurement import Measurement
+    from nerif.forward.registry import model_of, technique, technique_of
+    from nerif.reconstruction.aperture import apply_aperture
+    from nerif.results.directory import ResultDirectory
+
     check_output(settings.out, settings.force, endings=(".nc",))
     result = ResultDirectory(settings.result)
     index, box, n_ambient = result.field()

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
+import io
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
+from contextlib import ExitStack, contextmanager, redirect_stderr
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
-
-import psutil
+from typing import Annotated, ClassVar, Literal, TypeVar
 
 from nerif.cli.arguments import flag_value
 from nerif.cli.output import MONITOR
-from nerif.cli.settings import Settings, read_settings, setting_of
+from nerif.cli.settings import Settings, compute, read_settings, setting_of
 from nerif.common.conventions import InputError
 from nerif.common.installation import install
 from nerif.common.settings import MISSING, Count, Flat, NoOption, Positional
@@ -23,11 +22,11 @@ from nerif.reconstruction.methods import METHODS
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.neural.presets import PRESETS, preset
 from nerif.reconstruction.reconstructor import OnStep, Reconstruction, Reconstructor, Step
-from nerif.results.directory import RUN
-from nerif.workflow.job import Run
-from nerif.workflow.pipeline import reconstruct_into
+from nerif.workflow.run_settings import Run
 
 __all__ = ["Reconstruct", "ReconstructNeRIF", "command_of", "main", "run"]
+
+P = TypeVar("P", bound=Settings)
 
 SCALAR_STEPS, SCALAR_SECONDS = 20, 5.0  # between TensorBoard scalars, whichever is shorter
 
@@ -96,6 +95,10 @@ def _command(method: str, kind: type[Reconstructor]) -> type[Reconstruct]:
 
 def run(settings: Reconstruct) -> Reconstruction:
     """Reconstruct, and write the files of docs/formats.md."""
+    import psutil
+
+    from nerif.workflow.pipeline import reconstruct_into
+
     attributes = {"preset": getattr(settings, "preset", None), "tensorboard": settings.tensorboard}
     with _scalars(settings) as scalars:
         return reconstruct_into(
@@ -135,14 +138,27 @@ def main(arguments: list[str]) -> None:
     """Parse and run."""
     file, out = None, flag_value(arguments, "out")
     if "--resume" in arguments and flag_value(arguments, "config") is None and out is not None:
+        from nerif.results.directory import RUN
+
         file = Path(out) / RUN
         if not file.is_file():
             raise InputError(f"expected an interrupted run to resume, got no {RUN} in it", field=out)
     method = setting_of("method", arguments, "nerif", file)
-    command = command_of(method)
-    defaults: dict[str, Any] = {"measurement": MISSING, "out": MISSING, "method": method}
-    if method == "nerif":
-        name = setting_of("preset", arguments, "auto", file)
-        defaults |= {"preset": name, "reconstructor": preset(name)}
-    if run(read_settings(command(**defaults), arguments, "reconstruct", file)).outcome.failed:
+    default = command_of(method)(MISSING, MISSING, method=method)
+    if isinstance(default, ReconstructNeRIF):
+        settings: Reconstruct = read_with_preset(default, arguments, "reconstruct", file)
+    else:
+        settings = read_settings(default, arguments, "reconstruct", file)
+    if compute(run, settings).outcome.failed:
         raise SystemExit(1)
+
+
+def read_with_preset(default: P, arguments: list[str], name: str, file: Path | None = None) -> P:
+    """Return the settings of a command that trains a network; its defaults are those of the preset."""
+    chosen = setting_of("preset", arguments, "auto", file)
+    first = PRESETS["fast"] if chosen == "auto" else preset(chosen)
+    settings = read_settings(replace(default, preset=chosen, reconstructor=first), arguments, name, file)
+    if chosen != "auto" or (best := preset("auto")) == first:  # whether there is a GPU is known to PyTorch only
+        return settings
+    with redirect_stderr(io.StringIO()):  # notes, for the second time
+        return read_settings(replace(default, preset=chosen, reconstructor=best), arguments, name, file)

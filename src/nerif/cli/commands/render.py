@@ -13,10 +13,8 @@ from nerif.common.conventions import AMBIENT_INDEX
 from nerif.common.installation import command_line, word_of
 from nerif.common.interruption import if_interrupted
 from nerif.common.settings import Flat
-from nerif.fields.phantoms import make_phantom
-from nerif.geometry import Box, Ring
-from nerif.results.directory import ResultDirectory
-from nerif.simulation.experiment import Experiment
+from nerif.geometry.rig import Ring
+from nerif.simulation.experiment_settings import ExperimentSettings
 
 __all__ = ["Render", "main", "run"]
 
@@ -46,15 +44,20 @@ class Render(Settings):
     """Voxels of the true field along the longest edge."""
     force: bool = False
     """Write into a folder that is not empty."""
-    images: Annotated[Experiment, Flat] = field(default_factory=Experiment)
+    images: Annotated[ExperimentSettings, Flat] = field(default_factory=ExperimentSettings)
     ring: Annotated[Ring, Flat] = field(default_factory=Ring)
 
 
 def run(settings: Render) -> None:
     """Write images and true field."""
+    from nerif.fields.phantoms import make_phantom
+    from nerif.geometry import Box
+    from nerif.results.directory import ResultDirectory
+    from nerif.simulation.experiment import Experiment
+
     directory = ResultDirectory(settings.out)
     directory.check_free(settings.force)
-    cameras, images = settings.ring.cameras(settings.f_number), settings.images
+    cameras, images = settings.ring.cameras(settings.f_number), Experiment(**vars(settings.images))
     box = Box.around_origin(settings.box)
     phantom = make_phantom(settings.phantom, box, settings.phantom_seed)
     count = itertools.count(1)

@@ -11,8 +11,6 @@ from nerif.cli.output import MONITOR
 from nerif.cli.settings import Settings, command
 from nerif.common.files import ending
 from nerif.common.settings import Positional
-from nerif.results.directory import REPORT
-from nerif.workflow.reports import write_report, write_sequence_report
 
 __all__ = ["Report", "main", "run"]
 
@@ -31,6 +29,9 @@ class Report(Settings):
 
 def run(settings: Report) -> Path:
     """Write the report, and print what it lacks."""
+    from nerif.results.directory import REPORT
+    from nerif.workflow.reports import write_report, write_sequence_report
+
     is_store = ending(settings.result) == ".zarr"
     out = settings.out or (settings.result.with_suffix(".html") if is_store else settings.result / REPORT)
     if settings.out is not None:

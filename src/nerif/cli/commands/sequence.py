@@ -4,21 +4,23 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from annotated_types import Ge
 
 from nerif.cli.commands import velocity
+from nerif.cli.commands.reconstruct import read_with_preset
 from nerif.cli.output import MONITOR, figures_bar
-from nerif.cli.settings import Settings, read_settings, setting_of
+from nerif.cli.settings import Settings, compute
 from nerif.common.settings import MISSING, Flat, Positional
-from nerif.flow.assimilation import VelocityFit
+from nerif.flow.velocity_settings import VelocitySettings
 from nerif.reconstruction.neural.neural import NeRIF
-from nerif.reconstruction.neural.presets import PRESETS, preset
-from nerif.workflow.sequence import store
+from nerif.reconstruction.neural.presets import PRESETS
 from nerif.workflow.sequence.plan import SequenceSettings
-from nerif.workflow.sequence.reconstruct_sequence import reconstruct_sequence
-from nerif.workflow.sequence.run import Progress
+
+if TYPE_CHECKING:
+    from nerif.workflow.sequence import store
+    from nerif.workflow.sequence.run import Progress
 
 __all__ = ["Sequence", "main", "run"]
 
@@ -55,12 +57,14 @@ class Sequence(Settings):
     reconstructor: Annotated[NeRIF, Flat] = field(default_factory=NeRIF)
     velocity: Path | None = None
     """Velocity (.zarr) to compute from the complete result, as nerif velocity does."""
-    flow: VelocityFit = field(default_factory=VelocityFit)
+    flow: VelocitySettings = field(default_factory=VelocitySettings)
     """Its settings."""
 
 
 def run(settings: Sequence) -> store.SequenceStore:
     """Reconstruct the missing frames, and print a table of the result; then compute the velocity, if requested."""
+    from nerif.workflow.sequence.reconstruct_sequence import reconstruct_sequence
+
     if settings.velocity is not None:
         velocity.check(settings.velocity, settings.out, settings.frames.quantities, settings.force)
     with figures_bar("frames") as bar:
@@ -86,9 +90,9 @@ def run(settings: Sequence) -> store.SequenceStore:
 
 def main(arguments: list[str]) -> None:
     """Parse and run."""
-    name = setting_of("preset", arguments, "auto")
-    reconstructor = preset(name)
-    default = Sequence(MISSING, MISSING, preset=name, reconstructor=reconstructor)
-    status = run(read_settings(default, arguments, "sequence")).status
+    settings = read_with_preset(Sequence(MISSING, MISSING), arguments, "sequence")
+    from nerif.workflow.sequence import store
+
+    status = compute(run, settings).status
     if (status == store.MISSING).any() or not (status == store.DONE).any():
         raise SystemExit(1)

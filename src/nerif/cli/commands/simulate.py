@@ -13,9 +13,8 @@ from nerif.common.conventions import InputError, with_unit
 from nerif.common.interruption import if_interrupted
 from nerif.common.locks import locked
 from nerif.common.settings import Flat
-from nerif.data.volume import write_netcdf
-from nerif.geometry import Ring
-from nerif.simulation.simulate import Simulation
+from nerif.geometry.rig import Ring
+from nerif.simulation.simulation import Simulation
 
 __all__ = ["Simulate", "main", "run"]
 
@@ -43,6 +42,8 @@ def truth_path(out: Path) -> Path:
 
 def run(settings: Simulate) -> None:
     """Write the measurement, or a sequence, and the true field."""
+    from nerif.data.volume_file import write_netcdf
+
     out, truth = settings.out, truth_path(settings.out)
     times = instants(settings.times) if settings.times else ()
     check_output(out, settings.force, truth, endings=(".zarr",) if times else (".nc",))

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
-from nerif.analysis.velocity_verdict import MOST_MISFIT
 from nerif.cli.arguments import check_output
 from nerif.cli.output import MONITOR, figures_bar
 from nerif.cli.settings import Settings, command
 from nerif.common.conventions import InputError
 from nerif.common.settings import Flat, Positional
-from nerif.data.velocity_sequence import VelocitySequence
-from nerif.data.volume import INDEX
-from nerif.flow.assimilation import FitIterate, VelocityFit
-from nerif.workflow.film_velocity import DENSITY, velocity_of_film
-from nerif.workflow.reports import write_sequence_report
+from nerif.data.quantity_names import INDEX
+from nerif.flow.velocity_settings import VelocitySettings
+
+if TYPE_CHECKING:
+    from nerif.data.velocity_sequence import VelocitySequence
+    from nerif.flow.assimilation import FitIterate
 
 __all__ = ["Velocity", "check", "main", "run"]
 
@@ -36,11 +36,11 @@ class Velocity(Settings):
     """First frame, and the one after the last (default: all)."""
     measurement: Path | None = None
     """Measurement sequence (.zarr) of the film (default: the one that the film names)."""
-    density: Literal[*DENSITY] = "auto"  # type: ignore[valid-type]
+    density: Literal["auto", "improved", "film"] = "auto"
     """Improved from the displacements of all frames and the velocity, film (as it is), or auto (if possible)."""
     force: bool = False
     """Overwrite an existing result."""
-    fit: Annotated[VelocityFit, Flat] = field(default_factory=VelocityFit)
+    fit: Annotated[VelocitySettings, Flat] = field(default_factory=VelocitySettings)
 
 
 def check(out: Path, film: Path, quantities: tuple[str, ...], force: bool) -> None:
@@ -54,6 +54,11 @@ def check(out: Path, film: Path, quantities: tuple[str, ...], force: bool) -> No
 
 def run(settings: Velocity) -> VelocitySequence:
     """Compute the velocity, and write its report; exit with 1 if it does not explain the film."""
+    from nerif.analysis.velocity_verdict import MOST_MISFIT
+    from nerif.flow.assimilation import VelocityFit
+    from nerif.workflow.film_velocity import velocity_of_film
+    from nerif.workflow.reports import write_sequence_report
+
     check_output(settings.out, settings.force, endings=(".zarr",))
     with figures_bar("velocity") as bar:
 
@@ -67,7 +72,7 @@ def run(settings: Velocity) -> VelocitySequence:
         result = velocity_of_film(
             settings.film,
             settings.out,
-            settings.fit,
+            VelocityFit(**vars(settings.fit)),
             frames=settings.frames,
             measurement=settings.measurement,
             density=settings.density,

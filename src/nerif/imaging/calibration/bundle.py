@@ -26,9 +26,8 @@ from nerif.geometry import PERSPECTIVE, Projection
 from nerif.geometry.distortion import POWERS, distort, tilt, tilt_slopes
 from nerif.imaging.calibration.targets import Detection
 
-__all__ = ["COEFFICIENTS", "INTRINSIC", "TILT", "CameraBundle", "Pose", "TargetObservation", "adjust", "crossing"]
+__all__ = ["INTRINSIC", "CameraBundle", "Pose", "TargetObservation", "adjust", "crossing"]
 
-COEFFICIENTS, TILT = ("k1", "k2", "p1", "p2", "k3"), ("tau_x", "tau_y")
 HUBER = 5  # residual over noise beyond which the loss is linear
 PRINCIPAL_SIGMA = 0.03  # of the principal point from the middle of the image, over the image width
 DISTORTION_SIGMA = (0.5, 5.0, 0.005, 0.005, 5.0)  # of COEFFICIENTS; of a telecentric camera with (x, y) over

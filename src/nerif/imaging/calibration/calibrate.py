@@ -8,106 +8,33 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from typing import Literal
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
 
-from nerif.common.conventions import FACES, InputError
+from nerif.common.conventions import InputError
 from nerif.common.files import check_known
-from nerif.common.settings import Positive, check_settings
-from nerif.geometry import PROJECTIONS, Projection, projection_named
-from nerif.imaging.calibration.bundle import COEFFICIENTS, TILT, CameraBundle, Pose, TargetObservation, adjust, crossing
+from nerif.imaging.calibration.bundle import CameraBundle, Pose, TargetObservation, adjust, crossing
+from nerif.imaging.calibration.calibration_settings import CalibrationSettings
 from nerif.imaging.calibration.first_guess import first_guess, mirror
 from nerif.imaging.calibration.result import Calibration
 from nerif.imaging.calibration.target_images import find_targets, pose_names
 from nerif.imaging.calibration.targets import CalibrationTarget, TargetDetections
 from nerif.imaging.readers.views import View
 
-__all__ = ["CalibrationSettings", "calibrate", "calibrate_views", "target_images"]
+__all__ = ["calibrate", "calibrate_views", "target_images"]
 
 MIN_SIDE_DIFFERENCE = 0.1  # between a rig and its mirror image, of the component of a camera's direction along `side`
 SOURCES = ("target", "background")
+STANDARD = CalibrationSettings()
 INITIAL_NOISE, MIN_NOISE = 0.1, 1e-4  # px, of a point: before it is estimated; lower bound of the estimate
-
-
-@dataclass(frozen=True)
-class CalibrationSettings:
-    """Settings of a calibration from target images."""
-
-    projection: Literal[*PROJECTIONS] = "perspective"  # type: ignore[valid-type]
-    """Projection of all cameras: perspective or telecentric."""
-    distortion: tuple[str, ...] = ("k1", "k2", "p1", "p2")
-    """Distortion coefficients to determine, from k1 k2 p1 p2 k3; the others are 0."""
-    scheimpflug: bool = False
-    """Determine the two tilt angles of each sensor, of lenses on Scheimpflug adapters; perspective only."""
-    world: str = ""
-    """Name of the target pose that defines the world frame; default: the one that most cameras see."""
-    axes: tuple[str, str, str] = ("x+", "z+", "y-")
-    """World x, y, z along axes of the target in that pose (x right, y down, z into the page); default: z is up."""
-    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Centre of the target in that pose, in world coordinates, mm."""
-    max_error: Positive = 1.0
-    """Largest rms reprojection error to accept, px."""
-    side: tuple[str, str] | None = None
-    """For telecentric cameras: one view and the side of the world on which it stands, such as cam1 x+; images of flat
-    targets do not distinguish a telecentric rig from its mirror image."""
-
-    def __post_init__(self) -> None:
-        for name in self.distortion:
-            if name not in COEFFICIENTS:
-                raise InputError(
-                    f"expected coefficients from {' '.join(COEFFICIENTS)}, got '{name}'", field="distortion"
-                )
-        check_settings(self)
-        if self.scheimpflug and not self.kind.shows_depth:
-            raise InputError(
-                f"expected perspective, got {self.projection}; leave it out, since fx and fy of parallel rays describe "
-                "a sensor tilted about its rows or columns",
-                field="scheimpflug",
-            )
-        if not self.kind.shows_depth and (self.side is None or self.side[1] not in FACES):
-            raise InputError(
-                f"expected a view and the side of the world on which it stands ({' '.join(FACES)}), such as cam1 x+, "
-                "since images of flat targets do not distinguish a telecentric rig from its mirror image; got "
-                f"{self.side}",
-                field="side",
-            )
-        if not np.isclose(np.linalg.det(self.rotation), 1):
-            raise InputError(
-                f"expected three different axes of the target that make a right-handed world, such as x+ z+ y-, "
-                f"got {' '.join(self.axes)}",
-                field="axes",
-            )
-
-    def check_names(self, names: Sequence[str]) -> None:
-        """Refuse a side of a view that is not among these."""
-        if self.side is not None and self.side[0] not in names:
-            raise InputError(f"expected one of {', '.join(names)}, got '{self.side[0]}'", field="side")
-
-    @property
-    def kind(self) -> Projection:
-        """Projection of the cameras."""
-        return projection_named(self.projection)
-
-    @property
-    def coefficients(self) -> tuple[str, ...]:
-        """Coefficients of distortion and tilt to determine."""
-        return (*self.distortion, *(TILT if self.scheimpflug else ()))
-
-    @property
-    def rotation(self) -> Float[np.ndarray, "3 3"]:
-        """Rotation from the target's axes to the world's."""
-        unit = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1)}
-        rows = [np.array(unit.get(a.rstrip("+-"), (0, 0, 0))) * (-1 if a.endswith("-") else 1) for a in self.axes]
-        return np.array(rows, dtype=np.float64)
 
 
 def calibrate_views(
     views: Sequence[View],
     target: CalibrationTarget,
-    settings: CalibrationSettings = CalibrationSettings(),
+    settings: CalibrationSettings = STANDARD,
     background_scale: float = 1.0,
     background_distance: float | None = None,
     say: Callable[[str], None] = lambda text: None,
@@ -141,7 +68,7 @@ def target_images(views: Sequence[View]) -> int:
 
 def calibrate(
     views: Sequence[TargetDetections],
-    settings: CalibrationSettings = CalibrationSettings(),
+    settings: CalibrationSettings = STANDARD,
     background_distance: float | None = None,
 ) -> Calibration:
     """Calibrate all cameras from the detections in their images.

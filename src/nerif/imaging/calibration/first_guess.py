@@ -22,7 +22,8 @@ from jaxtyping import Float
 
 from nerif.common.conventions import InputError
 from nerif.geometry import PERSPECTIVE, TELECENTRIC, Projection
-from nerif.imaging.calibration.bundle import COEFFICIENTS, INTRINSIC, TILT, CameraBundle, Pose, TargetObservation
+from nerif.imaging.calibration.bundle import INTRINSIC, CameraBundle, Pose, TargetObservation
+from nerif.imaging.calibration.calibration_settings import COEFFICIENTS, TILT
 from nerif.imaging.calibration.targets import Detection, TargetDetections
 
 __all__ = ["first_guess", "mirror"]

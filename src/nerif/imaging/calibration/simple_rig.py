@@ -11,7 +11,6 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -19,14 +18,13 @@ import torch
 from jaxtyping import Float
 
 from nerif.common.conventions import InputError
-from nerif.common.settings import Length, check_settings
 from nerif.data.cameras_file import CalibratedCamera, check_camera
 from nerif.geometry import Box, Lens, Plane
-from nerif.imaging.calibration.importers.importers import ImportSettings
+from nerif.imaging.calibration.calibration_settings import ImportSettings, SimpleRig
 from nerif.imaging.readers.open import open_frames
 from nerif.imaging.readers.views import find_views
 
-__all__ = ["RULER", "SimpleRig", "box_about_axis", "find_image", "simple_camera"]
+__all__ = ["RULER", "box_about_axis", "find_image", "simple_camera"]
 
 RULER = 1.0, 0.5
 """Default standard deviations of the position (mm) and rotation (degrees) of a camera placed with a ruler."""
@@ -35,75 +33,6 @@ ROUNDING = 100  # corners of the box are rounded to a power of ten below the edg
 ROUNDING_TOLERANCE = 1e-6  # in steps of the rounding
 EDGE_TOLERANCE = 1e-9  # of the image
 
-Pixel = tuple[float, float]
-
-
-@dataclass(frozen=True)
-class SimpleRig:
-    """Measures of one camera that looks across the axis of a flow."""
-
-    distance: Length | None = None
-    """With --simple: distance along the optical axis from the camera (entrance pupil) to the axis of the flow, mm."""
-    mm_per_px: Length | None = None
-    """With --simple: mm per pixel at the axis: length of a ruler held there over its length in the image."""
-    focal_length: Length | None = None
-    """With --simple, without mm_per_px: focal length of the lens, mm; some per cent off for close-ups."""
-    pixel_pitch_um: Length | None = None
-    """With --focal-length: pixel pitch of the sensor, micrometres."""
-    f_number: Length | None = None
-    """With --focal-length: f-number of the lens, which is then focused on the background; without it, thin rays."""
-    axis_from: Pixel | None = None
-    """With --simple: column and row of a point of the axis; default: the middle of the image's lower edge."""
-    axis_to: Pixel | None = None
-    """With --simple: column and row of a point further along z+ (downstream); default: the middle of the upper edge."""
-    principal_point: Pixel | None = None
-    """With --simple: column and row of the optical axis, if it is not in the middle of the image (of a crop)."""
-
-    def __post_init__(self) -> None:
-        check_settings(self)
-        for name in ("axis_from", "axis_to", "principal_point"):
-            value = getattr(self, name)
-            if value is not None and not math.isfinite(math.fsum(value)):
-                raise InputError(f"expected column and row of a pixel, got {value}", field=name)
-        first, last = self.axis_from, self.axis_to
-        if (first is None) != (last is None) or (first and last and not math.dist(first, last) >= 1):
-            got = f"{first} and {last}"
-            raise InputError(
-                f"expected two pixels at least 1 px apart or neither, got {got}", field="axis_from, axis_to"
-            )
-        if self.mm_per_px is not None and self.pixel_pitch_um is not None:
-            raise InputError("expected one of the two scales, got both", field="mm_per_px, pixel_pitch_um")
-        if self.f_number is not None and self.focal_length is None:
-            raise InputError(
-                "expected together with focal_length, got it alone; or give --aperture-diameter, their quotient in mm",
-                field="f_number",
-            )
-
-    @property
-    def entries(self) -> dict[str, float | Pixel]:
-        """The measures that are not None."""
-        values = {name: getattr(self, name) for name in self.__dataclass_fields__}
-        return {name: value for name, value in values.items() if value is not None}
-
-    @property
-    def scale(self) -> float:
-        """Width of a pixel at the axis, mm."""
-        if self.mm_per_px is not None:
-            return self.mm_per_px
-        if self.focal_length is None or self.pixel_pitch_um is None:
-            raise InputError(
-                "expected the scale at the axis, or focal_length and pixel_pitch_um; hold a ruler at the "
-                "axis, and divide its length by that in the image",
-                field="mm_per_px",
-            )
-        return self.depth * self.pixel_pitch_um / 1000 / self.focal_length
-
-    @property
-    def depth(self) -> float:
-        """The distance, mm."""
-        if self.distance is None:
-            raise InputError("expected mm from the camera to the axis of the flow, got none", field="distance")
-        return self.distance
 
 
 def find_image(

@@ -15,17 +15,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Literal
 
 import numpy as np
-from annotated_types import Ge, Lt
 from jaxtyping import Bool, Float, Shaped
 
 from nerif.common.conventions import InputError
-from nerif.common.settings import Positive, check_settings
 from nerif.imaging.displacement.optical_flow import FLOWS
 from nerif.imaging.displacement.photometry import CameraNoise, ImagePair
 from nerif.imaging.displacement.warping import warp
+from nerif.imaging.imaging_settings import DisplacementSettings
 from nerif.imaging.noise import FLOOR, local_correlation, smoothing_error, structure_variance
 from nerif.imaging.quality.thumbnails import Thumbnail, common_shift
 from nerif.imaging.readers.exposure import saturated
@@ -33,47 +31,18 @@ from nerif.imaging.readers.frames import as_float
 from nerif.imaging.shake import border, remove_shake
 
 __all__ = [
-    "OVEREXPOSED", "DisplacementMap", "DisplacementSettings", "Reference", "displacement", "measure",
+    "OVEREXPOSED", "DisplacementMap", "Reference", "displacement", "measure",
 ]  # fmt: skip
 
 Grey = Shaped[np.ndarray, "row column"]
 Image = Float[np.ndarray, "row column"]
 Vectors = Float[np.ndarray, "row column 2"]
 PixelMask = Bool[np.ndarray, "row column"]
-REACH = {"deepflow": 1.5, "dis": 1.5, "tvl1": 1.3, "ilk": 1.6, "correlation": 1.8}
-"""Standard deviation (px) of the averaging window of each method at smoothness 1 (benchmarks/displacement.py)."""
 
 OVEREXPOSED, UNEVEN = "over-exposed", "displaced too unevenly"  # causes of loss
 FAR = 5.0  # px beyond the shift of the whole image; from here on d is measured in both directions
 MAX_REPEATS = 12  # reference frames that are compared with the mean of the others,
 MEGAPIXEL = 2**20  # in images up to this number of pixels
-
-
-@dataclass(frozen=True)
-class DisplacementSettings:
-    """Settings of the displacement measurement."""
-
-    method: Literal[*FLOWS] = "correlation"  # type: ignore[valid-type]
-    """correlation (windows of 12 px x smoothness; best on dots), dis (fast, good on noise), deepflow (the paper's),
-    ilk, tvl1."""
-    smoothness: Positive = 1.0
-    """Above 1 for smoother displacements; scales window or regularisation (fixed for deepflow)."""
-    local_contrast: Annotated[int, Ge(0)] = 0
-    """Window (px) over which brightness and contrast are equalised; 0 matches them over the whole image only."""
-    shake_border: Annotated[int, Ge(0)] = 0
-    """Width (px) of the flow-free border to which shift, rotation and zoom are fitted and removed; 0 for none."""
-    max_sigma: Positive = 0.5
-    """Pixels with more noise than this are not valid, px."""
-    min_correlation: Annotated[float, Ge(-1), Lt(1)] = 0.5
-    """Pixels with a lower local correlation of flow image and warped reference are not valid."""
-
-    def __post_init__(self) -> None:
-        check_settings(self)
-
-    @property
-    def reach(self) -> float:
-        """Standard deviation of the averaging window of the method, px."""
-        return REACH[self.method] * (1.0 if self.method == "deepflow" else self.smoothness)
 
 
 @dataclass(frozen=True)

@@ -31,8 +31,9 @@ from nerif.common.pauses import pause
 from nerif.data.measurement import Measurement
 from nerif.fields.field import Field
 from nerif.fields.sum import SumField
+from nerif.forward.model_names import AUTO
 from nerif.forward.path_integral import PathIntegral, project
-from nerif.forward.registry import AUTO, forward_models
+from nerif.forward.registry import forward_models
 from nerif.geometry import Grid
 from nerif.geometry.symmetry import Axis
 from nerif.reconstruction.aperture import apply_aperture
@@ -43,9 +44,9 @@ from nerif.reconstruction.gauge import with_gauge
 from nerif.reconstruction.shared_settings import SharedSettings
 from nerif.reconstruction.sources import of_source
 from nerif.reconstruction.target import Target
+from nerif.reconstruction.voxels.face_gradients import gradient_square
 from nerif.reconstruction.voxels.layout import layout_of
 from nerif.reconstruction.voxels.levels import bins_of, resolved_voxels
-from nerif.reconstruction.voxels.total_variation import gradient_square
 from nerif.reconstruction.voxels.voxel_problem import Iterate, Problem
 
 __all__ = ["Detail", "DetailChoice", "Posterior", "check_sigma", "choose"]

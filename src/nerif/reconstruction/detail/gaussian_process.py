@@ -5,18 +5,18 @@ from __future__ import annotations
 import dataclasses
 import time
 from dataclasses import asdict, dataclass, replace
-from typing import ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 from nerif.common.settings import Count
-from nerif.data.measurement import Measurement
-from nerif.fields.field import Field
-from nerif.forward.registry import AUTO, MODEL_NAMES
-from nerif.reconstruction.detail.detail import COARSE, Detail, Posterior, check_sigma
-from nerif.reconstruction.device import peak_memory
+from nerif.forward.model_names import AUTO, MODEL_NAMES
 from nerif.reconstruction.reconstructor import OnStep, Outcome, Reconstruction, State, Step
-from nerif.reconstruction.rig_parameters import with_corrections
 from nerif.reconstruction.shared_settings import SHORT_RUN, SharedSettings, Source
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
+
+if TYPE_CHECKING:
+    from nerif.data.measurement import Measurement
+    from nerif.fields.field import Field
+    from nerif.reconstruction.detail.detail import Posterior
 
 __all__ = ["GaussianProcess"]
 
@@ -62,6 +62,10 @@ class GaussianProcess(SharedSettings):
         self, measurement: Measurement, on_step: OnStep | None = None, resume: State | None = None,
         start: Field | None = None,
     ) -> Reconstruction:  # fmt: skip
+        from nerif.reconstruction.detail.detail import COARSE, Detail, check_sigma
+        from nerif.reconstruction.device import peak_memory
+        from nerif.reconstruction.rig_parameters import with_corrections
+
         begin = time.perf_counter()
         check_sigma(measurement)
 

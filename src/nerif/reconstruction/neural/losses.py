@@ -11,48 +11,24 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from typing import Literal, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerif.common.conventions import InputError
 from nerif.fields.network import Network, NeuralField
 from nerif.forward.forward_model import Weights
 from nerif.forward.path_integral import places
 from nerif.geometry import Rays
 from nerif.reconstruction.device import autocast_dtype, float32_products, keep_compiled_code_private
+from nerif.reconstruction.neural.training_settings import LossWeights
 from nerif.reconstruction.target import TechniqueData
 
-__all__ = ["DATA_TERMS", "Evaluator", "LossWeights", "MixedPrecision", "loss_terms"]
+__all__ = ["DATA_TERMS", "Evaluator", "MixedPrecision", "loss_terms"]
 
 DATA_TERMS = ("automatic", "head", "numerical")
 """Terms that compare a prediction with the measurement."""
-
-
-@dataclass(frozen=True)
-class LossWeights:
-    """Weights of the terms of the loss."""
-
-    consistency: float = 0.0
-    """|grad(n)_AD - grad(n)_net| over sample points (paper: 1)."""
-    numerical: float = 0.0
-    """|d_ND - d| over rays (paper: 1)."""
-    head: float = 0.0
-    """|d_net - d| over rays (paper: 1)."""
-    automatic: float = 1.0
-    """|d_AD - d| over rays (paper: 0)."""
-    gauge: float = 1.0
-    """N over the ambient region."""
-
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if not value >= 0:
-                raise InputError(f"expected 0 or more, got {value}", field=f"weight of the {name} term")
-        if self.numerical + self.head + self.automatic == 0:
-            raise InputError("expected a positive numerical, head or automatic weight, got none", field="loss weights")
 
 
 @runtime_checkable

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
-from nerif.data.measurement import Measurement
-from nerif.fields.field import Field
-from nerif.reconstruction.neural.trainer import Trainer
-from nerif.reconstruction.neural.training_data import TrainingData
 from nerif.reconstruction.neural.training_settings import TrainingSettings
-from nerif.reconstruction.reconstructor import OnStep, Reconstruction, State
+
+if TYPE_CHECKING:
+    from nerif.data.measurement import Measurement
+    from nerif.fields.field import Field
+    from nerif.reconstruction.reconstructor import OnStep, Reconstruction, State
 
 __all__ = ["NeRIF"]
 
@@ -29,4 +29,7 @@ class NeRIF(TrainingSettings):
         resume: State | None = None,
         start: Field | None = None,
     ) -> Reconstruction:
+        from nerif.reconstruction.neural.trainer import Trainer
+        from nerif.reconstruction.neural.training_data import TrainingData
+
         return Trainer(self, TrainingData(self, measurement, withhold=not self.limited), resume, start).run(on_step)

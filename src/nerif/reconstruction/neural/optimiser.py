@@ -35,7 +35,8 @@ from torch import Tensor
 from torch.optim.adam import adam
 
 from nerif.common.conventions import InputError
-from nerif.fields.network import Network, NetworkShape, encoded_width
+from nerif.fields.network import Network
+from nerif.fields.network_shape import NetworkShape, encoded_width
 
 __all__ = ["OPTIMISERS", "NetworkOptimiser", "Optimiser", "adam_step"]
 

@@ -5,13 +5,11 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-import torch
-
 from nerif.common.conventions import InputError
 from nerif.common.files import check_known
-from nerif.fields.network import NetworkShape
-from nerif.reconstruction.neural.losses import LossWeights
+from nerif.fields.network_shape import NetworkShape
 from nerif.reconstruction.neural.neural import NeRIF
+from nerif.reconstruction.neural.training_settings import LossWeights
 
 __all__ = ["PRESETS", "preset"]
 
@@ -49,6 +47,8 @@ PRESETS: dict[str, NeRIF] = {
 def preset(name: str, **changes: Any) -> NeRIF:
     """Return the settings of a preset, with changes such as max_steps=500; "auto" is `best` with a GPU, else `fast`."""
     if name == "auto":
+        import torch
+
         name = "best" if torch.cuda.is_available() else "fast"
     if name not in PRESETS:
         raise InputError(f"expected auto, {', '.join(PRESETS)}, got '{name}'", field="preset")

@@ -31,7 +31,8 @@ from nerif.reconstruction.device import resolve_device
 from nerif.reconstruction.field_files import fingerprint
 from nerif.reconstruction.gauge import Gauge, is_open, with_gauge
 from nerif.reconstruction.neural.training_settings import TrainingSettings
-from nerif.reconstruction.rig_parameters import RefinedView, refined_groups
+from nerif.reconstruction.rig_groups import refined_groups
+from nerif.reconstruction.rig_parameters import RefinedView
 from nerif.reconstruction.rig_refinement import Refinement, load_rig, random_pixels, rig_state
 from nerif.reconstruction.sources import of_source, resolve_source, stages
 from nerif.reconstruction.target import Target, TechniqueData, check_target

@@ -10,16 +10,38 @@ from annotated_types import Ge, Gt
 
 from nerif.common.conventions import InputError
 from nerif.common.settings import Developer, NonNegative, Positive
-from nerif.fields.network import NetworkShape
-from nerif.forward.registry import AUTO, MODEL_NAMES
-from nerif.geometry.symmetry import NO_SYMMETRY
-from nerif.reconstruction.neural.losses import LossWeights
+from nerif.fields.network_shape import NetworkShape
+from nerif.forward.model_names import AUTO, MODEL_NAMES
+from nerif.geometry.symmetry_names import NO_SYMMETRY
 from nerif.reconstruction.shared_settings import SHORT_RUN, SharedSettings, Source
 
 if TYPE_CHECKING:
     from nerif.data.measurement import Measurement
 
-__all__ = ["TrainingSettings"]
+__all__ = ["LossWeights", "TrainingSettings"]
+
+
+@dataclass(frozen=True)
+class LossWeights:
+    """Weights of the terms of the loss."""
+
+    consistency: float = 0.0
+    """|grad(n)_AD - grad(n)_net| over sample points (paper: 1)."""
+    numerical: float = 0.0
+    """|d_ND - d| over rays (paper: 1)."""
+    head: float = 0.0
+    """|d_net - d| over rays (paper: 1)."""
+    automatic: float = 1.0
+    """|d_AD - d| over rays (paper: 0)."""
+    gauge: float = 1.0
+    """N over the ambient region."""
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not value >= 0:
+                raise InputError(f"expected 0 or more, got {value}", field=f"weight of the {name} term")
+        if self.numerical + self.head + self.automatic == 0:
+            raise InputError("expected a positive numerical, head or automatic weight, got none", field="loss weights")
 
 
 @dataclass(frozen=True)

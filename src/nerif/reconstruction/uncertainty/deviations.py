@@ -15,7 +15,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerif.data.volume import Volume, describe
+from nerif.data.quantity_names import describe
+from nerif.data.volume import Volume
 from nerif.fields.voxel_field import VoxelField
 from nerif.geometry import Grid
 from nerif.geometry.body import Body, contained

@@ -30,9 +30,9 @@ from nerif.reconstruction.rig_parameters import RefinedView
 from nerif.reconstruction.rig_refinement import Refinement, random_pixels
 from nerif.reconstruction.sources import of_source
 from nerif.reconstruction.target import Target
+from nerif.reconstruction.voxels.face_gradients import at_faces, gradient_square
 from nerif.reconstruction.voxels.levels import bins_of
 from nerif.reconstruction.voxels.operator import VoxelOperator
-from nerif.reconstruction.voxels.total_variation import at_faces, gradient_square
 from nerif.reconstruction.voxels.voxel_problem import Penalty, Problem
 
 __all__ = ["RigPosterior", "covariance"]

@@ -18,7 +18,7 @@ import math
 import time
 from dataclasses import asdict, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -43,10 +43,8 @@ from nerif.reconstruction.voxels.layout import layout_of
 from nerif.reconstruction.voxels.levels import Level, coarser, levels
 from nerif.reconstruction.voxels.symmetry_axis import axis_of
 from nerif.reconstruction.voxels.voxel_problem import Iterate, Problem
+from nerif.reconstruction.voxels.voxel_settings import VoxelSettings
 from nerif.reconstruction.voxels.weight import COARSE_WEIGHT, DISCREPANCY, choose_weight
-
-if TYPE_CHECKING:
-    from nerif.reconstruction.voxels.voxel_reconstructor import VoxelReconstructor
 
 __all__ = ["VoxelRun"]
 
@@ -73,7 +71,7 @@ class VoxelRun:
     """One run of a voxel method."""
 
     def __init__(
-        self, settings: VoxelReconstructor, measurement: Measurement, on_step: OnStep | None, resume: State | None,
+        self, settings: VoxelSettings, measurement: Measurement, on_step: OnStep | None, resume: State | None,
         start: Field | None,
     ) -> None:  # fmt: skip
         measurement = of_source(measurement, settings.source, preferred="displacements")

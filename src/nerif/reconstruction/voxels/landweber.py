@@ -7,15 +7,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import ClassVar
-
-from torch import Tensor
+from typing import TYPE_CHECKING, ClassVar
 
 from nerif.common.conventions import InputError
 from nerif.common.settings import NonNegative
-from nerif.reconstruction.voxels.operator import operator_norm
-from nerif.reconstruction.voxels.voxel_problem import Iterate, Problem
 from nerif.reconstruction.voxels.voxel_reconstructor import VoxelReconstructor
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from nerif.reconstruction.voxels.voxel_problem import Iterate, Problem
 
 __all__ = ["Landweber"]
 
@@ -50,6 +51,9 @@ class Landweber(VoxelReconstructor):
             )
 
     def iterate(self, problem: Problem, x: Tensor, weight: float) -> Iterator[Iterate]:
+        from nerif.reconstruction.voxels.operator import operator_norm
+        from nerif.reconstruction.voxels.voxel_problem import Iterate
+
         x = problem.clip(x)
         # the norm is estimated from below, and too long a step diverges
         norm = operator_norm(problem.forward, problem.adjoint, problem.random(), tolerance=1e-2)

@@ -11,23 +11,22 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from typing import ClassVar
-
-import torch
-from jaxtyping import Float
-from torch import Tensor
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
 
 from nerif.common.conventions import InputError
-from nerif.data.measurement import Measurement
-from nerif.geometry import Grid
-from nerif.reconstruction.voxels.operator import VoxelOperator
-from nerif.reconstruction.voxels.voxel_problem import Iterate, Problem
 from nerif.reconstruction.voxels.voxel_reconstructor import VoxelReconstructor
 
-__all__ = ["MART", "MLEM"]
+if TYPE_CHECKING:
+    from jaxtyping import Float
+    from torch import Tensor
 
-FLOOR = 1e-6  # of the mean: lower limit of the start, and of a prediction that is a divisor
+    from nerif.data.measurement import Measurement
+    from nerif.geometry import Grid
+    from nerif.reconstruction.voxels.ray_block import Block
+    from nerif.reconstruction.voxels.voxel_problem import Iterate, Problem
+
+__all__ = ["MART", "MLEM"]
 
 
 @dataclass(frozen=True)
@@ -38,6 +37,8 @@ class Multiplicative(VoxelReconstructor):
     """Start on a coarse grid and halve the voxels from solution to solution."""
 
     def iterate(self, problem: Problem, x: Tensor, weight: float) -> Iterator[Iterate]:
+        from nerif.reconstruction.voxels.voxel_problem import Iterate
+
         blocks = self.blocks(problem)
         while True:
             for block in blocks:
@@ -46,6 +47,8 @@ class Multiplicative(VoxelReconstructor):
 
     def begin(self, problem: Problem, x: Tensor) -> Tensor:
         """Return x, above 0 everywhere; for x <= 0 the uniform field whose projections have the sum of the data."""
+        from nerif.reconstruction.voxels.ray_block import FLOOR, Block
+
         for part in problem.target.parts:
             if not part.model.additive:
                 raise InputError(
@@ -56,7 +59,7 @@ class Multiplicative(VoxelReconstructor):
         mean = float(x.clamp_min(0).mean())
         if mean > 0:
             return problem.clip(x.clamp_min(FLOOR * mean))
-        block, uniform = Block.of(problem, None), problem.clip(torch.ones_like(x))
+        block, uniform = Block.of(problem, None), problem.clip(x.new_ones(x.shape))
         return uniform * (float(block.data.sum()) / max(float(block.project(uniform).sum()), block.floor) or 1.0)
 
     @abstractmethod
@@ -82,6 +85,8 @@ class MLEM(Multiplicative):
     """Maximum iterations."""
 
     def blocks(self, problem: Problem) -> list[Block]:
+        from nerif.reconstruction.voxels.ray_block import Block
+
         return [Block.of(problem, None)]
 
     def update(self, block: Block, x: Float[Tensor, "z y x"]) -> Float[Tensor, "z y x"]:
@@ -113,50 +118,11 @@ class MART(Multiplicative):
         return super().memory_bytes(measurement, grid, device) + self.operator_bytes(measurement, grid) + reach
 
     def blocks(self, problem: Problem) -> list[Block]:
+        from nerif.reconstruction.voxels.ray_block import Block
+
         views = sorted({int(v) for part in problem.target.parts for v in part.rays.view.unique()})
         return [Block.of(problem, view) for view in views]
 
     def update(self, block: Block, x: Float[Tensor, "z y x"]) -> Float[Tensor, "z y x"]:
         ratio = (block.data.clamp_min(block.floor) / block.project(x)).log()
-        return x * torch.exp(self.relaxation * block.back_project(ratio) / block.reach)
-
-
-@dataclass(frozen=True)
-class Block:
-    """The rays of one view or of all."""
-
-    operators: tuple[VoxelOperator, ...]  # one for each technique
-    data: Float[Tensor, " n"]  # measured values, 0 where noise made them negative
-    reach: Float[Tensor, "z y x"]  # A^T 1; 1 where no ray passes
-    scale: float  # field of one unit of x
-    floor: float  # of predictions
-
-    @classmethod
-    def of(cls, problem: Problem, view: int | None) -> Block:
-        """Return the block of a view, or of all."""
-        operators, values = [], []
-        for operator, part in zip(problem.operators, problem.target.parts, strict=True):
-            if view is not None:
-                rays = (part.rays.view == view).nonzero()[:, 0]
-                if not len(rays):
-                    continue
-                part = part[rays]
-                operator = operator.for_rays(part.rays, part.model)
-            operators.append(operator)
-            values.append(part.measured.reshape(-1).to(operator.device, operator.dtype))
-        data = torch.cat(values).clamp_min(0)
-        floor = FLOOR * float(data.mean()) or FLOOR
-        block = cls(tuple(operators), data, torch.ones_like(problem.zero()), problem.scale, floor)
-        reach = block.back_project(torch.ones_like(data))
-        return replace(block, reach=torch.where(reach > 0, reach, torch.ones_like(reach)))
-
-    def project(self, x: Float[Tensor, "z y x"]) -> Float[Tensor, " n"]:
-        """Return A x, no smaller than the floor."""
-        projections = [operator(x * self.scale).reshape(-1) for operator in self.operators]
-        return torch.cat(projections).clamp_min(self.floor)
-
-    def back_project(self, y: Float[Tensor, " n"]) -> Float[Tensor, "z y x"]:
-        """Return A^T y."""
-        parts = y.split([operator.range_shape[0] for operator in self.operators])
-        images = [a.T(part[:, None]) * self.scale for a, part in zip(self.operators, parts, strict=True)]
-        return torch.stack(images).sum(dim=0)
+        return x * (self.relaxation * block.back_project(ratio) / block.reach).exp()

@@ -15,12 +15,11 @@ from nerif.fields.voxel_field import DEGREES, Boundary, VoxelField
 from nerif.forward.forward_model import ForwardModel
 from nerif.geometry import Grid, Rays
 from nerif.reconstruction.device import share_threads
+from nerif.reconstruction.voxels.plane_spacing import MAX_STEP, check_step
 from nerif.reconstruction.voxels.planes import RayBundle
 
-__all__ = ["VoxelOperator", "apply_rows", "check_step", "operator_norm", "rays_through"]
+__all__ = ["VoxelOperator", "apply_rows", "operator_norm", "rays_through"]
 
-# distance of planes in voxels: the gradient of the linear basis jumps from voxel to voxel (docs/decisions/011)
-MAX_STEP = {"linear": 0.5, "cubic": 1.0}
 # of rays through a lens, per voxel of the cone's radius in the middle of the box; of a pixel
 PAIRS_PER_VOXEL, MAX_PAIRS = 2.0, 8
 
@@ -179,14 +178,6 @@ def rays_through(rays: Rays, length: float) -> int:
     middle = 0.5 * (rays.near + rays.far)
     spread = float(rays.half_width(middle).max())
     return 2 * min(MAX_PAIRS, max(1, math.ceil(PAIRS_PER_VOXEL * spread / length)))
-
-
-def check_step(step: float, basis: str) -> None:
-    """Raise InputError unless the distance of planes is in the range of the basis."""
-    if not 0 < step <= MAX_STEP[basis]:
-        raise InputError(
-            f"expected above 0 and at most {MAX_STEP[basis]:g} voxels (basis {basis}), got {step}", field="step"
-        )
 
 
 def apply_rows(matrix: Float[Tensor, "n c q"], integrals: Float[Tensor, "n q"]) -> Float[Tensor, "n c"]:

@@ -22,7 +22,8 @@ from torch import Tensor
 
 from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
-from nerif.geometry.symmetry import Axis, Symmetry, parse_symmetry
+from nerif.geometry.symmetry import Axis, Symmetry
+from nerif.geometry.symmetry_names import parse_symmetry
 from nerif.reconstruction.gauge import with_gauge
 from nerif.reconstruction.gauss_newton import AdaptingField, Information
 from nerif.reconstruction.shared_settings import SharedSettings

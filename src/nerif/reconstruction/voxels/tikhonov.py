@@ -7,12 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
-from torch import Tensor
-
-from nerif.reconstruction.voxels.voxel_problem import Iterate, Penalty, Problem, minimise
 from nerif.reconstruction.voxels.voxel_reconstructor import WeightedVoxelReconstructor
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from nerif.reconstruction.voxels.voxel_problem import Iterate, Problem
 
 __all__ = ["Tikhonov"]
 
@@ -25,8 +27,10 @@ class Tikhonov(WeightedVoxelReconstructor):
     """
 
     title: ClassVar[str] = "Tikhonov"
-    penalty: Literal[*Penalty.KINDS] = "gradient"  # type: ignore[valid-type]
+    penalty: Literal["identity", "gradient", "laplacian"] = "gradient"
     """Quantity that is penalised: the field, its gradient, or its Laplacian."""
 
     def iterate(self, problem: Problem, x: Tensor, weight: float) -> Iterator[Iterate]:
+        from nerif.reconstruction.voxels.voxel_problem import Penalty, minimise
+
         yield from minimise(problem, Penalty(problem, self.penalty), weight, x)

@@ -7,18 +7,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import reduce
-from typing import ClassVar
-
-import torch
-from jaxtyping import Float
-from torch import Tensor
+from typing import TYPE_CHECKING, ClassVar
 
 from nerif.common.conventions import InputError
-from nerif.reconstruction.voxels.voxel_problem import Iterate, Penalty, Problem, minimise
 from nerif.reconstruction.voxels.voxel_reconstructor import WeightedVoxelReconstructor
 
-__all__ = ["TotalVariation", "at_faces", "gradient_square"]
+if TYPE_CHECKING:
+    from jaxtyping import Float
+    from torch import Tensor
+
+    from nerif.reconstruction.voxels.voxel_problem import Iterate, Problem
+
+__all__ = ["TotalVariation"]
 
 
 @dataclass(frozen=True)
@@ -52,6 +52,9 @@ class TotalVariation(WeightedVoxelReconstructor):
         return self.round  # the objective falls from round to round, not with every iteration
 
     def iterate(self, problem: Problem, x: Tensor, weight: float) -> Iterator[Iterate]:
+        from nerif.reconstruction.voxels.face_gradients import at_faces
+        from nerif.reconstruction.voxels.voxel_problem import Iterate, Penalty, minimise
+
         x = problem.clip(x)
         while True:
             # sqrt(g^2 + e^2) <= (g^2 + e^2) / (2 m) + m / 2 with equality at m = sqrt(g^2 + e^2) of this round
@@ -61,22 +64,6 @@ class TotalVariation(WeightedVoxelReconstructor):
                 yield Iterate(x, iterate.residual, float(self._magnitude(problem, x).mean()))
 
     def _magnitude(self, problem: Problem, x: Tensor) -> Float[Tensor, "z y x"]:
+        from nerif.reconstruction.voxels.face_gradients import gradient_square
+
         return (gradient_square(problem.differences(x)) + self.softness**2).sqrt()
-
-
-def gradient_square(along: tuple[Tensor, Tensor, Tensor]) -> Float[Tensor, "z y x"]:
-    """|grad|^2 at voxel centres: the mean of the squares at the two faces, summed over the axes."""
-    means = []
-    for axis, difference in enumerate(along):
-        square, n = difference.square(), difference.shape[axis] - 1
-        means.append(0.5 * (square.narrow(axis, 0, n) + square.narrow(axis, 1, n)))
-    return reduce(torch.add, means)
-
-
-def at_faces(weight: Float[Tensor, "z y x"]) -> tuple[Tensor, Tensor, Tensor]:
-    """Weights of the squares at the faces such that sum_voxels weight |grad|^2 = sum_faces weight difference^2."""
-    faces = []
-    for axis in range(3):
-        edge = torch.zeros_like(weight.narrow(axis, 0, 1))
-        faces.append(0.5 * (torch.cat([edge, weight], dim=axis) + torch.cat([weight, edge], dim=axis)))
-    return faces[0], faces[1], faces[2]

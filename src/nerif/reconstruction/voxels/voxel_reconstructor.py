@@ -1,140 +1,33 @@
-"""Settings of the voxel methods; each method is a generator of iterates (tikhonov.py, landweber.py, ...).
-
-descent.py has the loop over grids and iterations.
-"""
+"""A voxel method: its settings, and the loop over grids and iterations (descent.py)."""
 
 from __future__ import annotations
 
 import math
-from abc import abstractmethod
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from typing import Annotated, ClassVar, Literal
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
-import torch
 from annotated_types import Ge, Lt
-from torch import Tensor
 
-from nerif.common.settings import Count, NonNegative
-from nerif.data.measurement import Measurement
-from nerif.fields.field import Field
-from nerif.forward.registry import AUTO, MODEL_NAMES
-from nerif.geometry import Grid
-from nerif.reconstruction.reconstructor import OnStep, Reconstruction, State
-from nerif.reconstruction.shared_settings import SHORT_RUN, SharedSettings, Source
-from nerif.reconstruction.voxels import kernels_torch
-from nerif.reconstruction.voxels.descent import VoxelRun
-from nerif.reconstruction.voxels.levels import FINE_BIN, SMALLEST, bins_of, resolved_voxels
-from nerif.reconstruction.voxels.operator import VoxelOperator, check_step, rays_through
-from nerif.reconstruction.voxels.voxel_problem import Iterate, Problem
+from nerif.reconstruction.voxels.voxel_settings import VoxelSettings
+
+if TYPE_CHECKING:
+    from nerif.data.measurement import Measurement
+    from nerif.fields.field import Field
+    from nerif.reconstruction.reconstructor import OnStep, Reconstruction, State
 
 __all__ = ["VoxelReconstructor", "WeightedVoxelReconstructor"]
 
-VOLUME_ARRAYS = 22  # arrays of the size of the grid held by the most demanding method (tests/reconstruction)
-DATA_ARRAYS = 8  # arrays of the size of the data
-COMPILER_BYTES = 1 << 28  # of Numba, for any grid (benchmarks/results/voxel-cost-cpu.md)
-RAY_SECONDS = 2.5e-8  # of an iteration on one core, per ray and voxel along the longest edge (same table)
-MIN_VOXELS = 8  # along the longest edge in the cross-validation run
-
 
 @dataclass(frozen=True)
-class VoxelReconstructor(SharedSettings):
-    """Settings of every voxel method."""
-
-    coarse: ClassVar[float] = 100
-    """Times the tolerance, for solutions that are only a start."""
-    voxels: Count = 64
-    """Voxels along the longest edge of the box, in the reconstruction, where they are not smaller than 0.7 of a pixel,
-    and in the written volume."""
-    basis: Literal["linear", "cubic"] = "cubic"
-    """Interpolation between voxel centres: cubic B-splines, or trilinear (less accurate, slightly faster)."""
-    model: Literal[*MODEL_NAMES] = AUTO  # type: ignore[valid-type]
-    """Linear forward model of displacements: lever_arm (auto) or paraxial."""
-    source: Source = "auto"
-    """Data to fit: displacements, images (pixel by pixel, linearised about the displacements), both, or
-    auto (displacements where available)."""
-    step: float | None = None
-    """Largest distance between sampling planes along a ray, in voxels (default: 1 for cubic, 0.5 for linear)."""
-    coarse_to_fine: bool = True
-    """Start on a coarse grid and halve the voxel size from solution to solution."""
-    tolerance: NonNegative = 1e-4
-    """Convergence criterion: relative decrease of the objective per iteration, averaged over several."""
-    hull: bool = True
-    """Fix voxels outside the visual hull of the flow masks at the ambient index."""
-    precision: Literal["float32", "float64"] = "float32"
-    """Floating-point precision of voxels and data."""
-    iterations: Count = 50
-    """Maximum number of iterations per grid and regularisation weight."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.step is not None:
-            check_step(self.step, self.basis)
-
-    def split_for_cross_validation(self) -> tuple[VoxelReconstructor, VoxelReconstructor]:
-        voxels = max(min(MIN_VOXELS, self.voxels), self.voxels // 2)
-        return replace(self, voxels=voxels, time_limit=SHORT_RUN * self.time_limit), self
-
-    def resolved(self, measurement: Measurement) -> tuple[VoxelReconstructor, str]:
-        most = resolved_voxels(measurement)
-        overlap = all(camera.lens is not None and camera.lens.window >= 1 for camera in measurement.cameras)
-        if self.voxels <= most or overlap:
-            return self, ""
-        return replace(self, voxels=most), (
-            f"solved on {most} voxels along the longest edge instead of {self.voxels}: voxels below {SMALLEST:g} of a "
-            "pixel would have steps between the lines of sight (docs/pixels.md)"
-        )
-
-    @property
-    def weight(self) -> float | None:
-        """Regularisation weight; None: to be determined."""
-        return 0.0
-
-    @property
-    def patience(self) -> int:
-        """Iterations over which the decrease of the objective is averaged."""
-        return 3
-
-    @abstractmethod
-    def iterate(self, problem: Problem, x: Tensor, weight: float) -> Iterator[Iterate]:
-        """Yield iterates from x on, without end."""
-
-    def begin(self, problem: Problem, x: Tensor) -> Tensor:
-        """Return the first iterate of an initial field: the field clipped to its bounds."""
-        return problem.clip(x)
-
-    @property
-    def itemsize(self) -> int:
-        """Bytes of a number."""
-        return 4 if self.precision == "float32" else 8
-
-    def operator_bytes(self, measurement: Measurement, grid: Grid) -> int:
-        """Return the memory of the operators of all techniques."""
-        dtype, per_pixel = getattr(torch, self.precision), _lens_rays(measurement, grid)
-        return sum(
-            VoxelOperator.memory_bytes(per_pixel * rays, grid, self.basis, dtype, channels, self.step)
-            for rays, channels in _ray_counts(measurement, grid)
-        )
-
-    def memory_bytes(self, measurement: Measurement, grid: Grid, device: str = "cpu") -> int:
-        """Return the peak memory of a run, in addition to that of the process."""
-        counts = _ray_counts(measurement, grid)
-        rays, numbers = sum(n for n, _ in counts), sum(n * channels for n, channels in counts)
-        volumes, data = VOLUME_ARRAYS * math.prod(grid.shape) * self.itemsize, DATA_ARRAYS * numbers * self.itemsize
-        per_pixel = _lens_rays(measurement, grid)
-        preparing = 40 * 8 * rays * per_pixel  # rays in double precision, while the operator is set up
-        overhead = kernels_torch.CHUNK_BYTES if device == "cuda" else COMPILER_BYTES
-        return self.operator_bytes(measurement, grid) + volumes + data + preparing + overhead
-
-    def iteration_seconds(self, measurement: Measurement, grid: Grid, cores: int) -> float:
-        """Return about the time of an iteration on cores of a usual CPU, s."""
-        rays = sum(count for count, _ in _ray_counts(measurement, grid)) * _lens_rays(measurement, grid)
-        return RAY_SECONDS * rays * max(grid.shape) / cores
+class VoxelReconstructor(VoxelSettings):
+    """A method that solves for the coefficients of a grid."""
 
     def __call__(
         self, measurement: Measurement, on_step: OnStep | None = None, resume: State | None = None,
         start: Field | None = None,
     ) -> Reconstruction:  # fmt: skip
+        from nerif.reconstruction.voxels.descent import VoxelRun
+
         return VoxelRun(self, measurement, on_step, resume, start)()
 
 
@@ -149,22 +42,3 @@ class WeightedVoxelReconstructor(VoxelReconstructor):
     @property
     def weight(self) -> float | None:
         return None if self.regularisation == "auto" else float(self.regularisation)
-
-
-def _ray_counts(measurement: Measurement, grid: Grid) -> list[tuple[int, int]]:
-    """Return the numbers of rays, of bins where pixels are averaged, and of channels of each technique."""
-    pixels, counts = bins_of(measurement, grid, FINE_BIN) ** 2, []
-    for o in measurement.observations:
-        rays = int(measurement.usable_for(o).sum()) // (1 if o.technique.derived else pixels)
-        counts.append((rays + 1, len(o.technique.channels)))
-    return counts
-
-
-def _lens_rays(measurement: Measurement, grid: Grid) -> int:
-    """Return the largest number of rays per pixel, from a lattice of pixels of each image."""
-    most = 1
-    for camera in measurement.cameras:
-        lattice = [torch.linspace(0, n - 1, min(n, 9), dtype=camera.intrinsics.dtype) for n in camera.image_size[::-1]]
-        rays = camera.rays(torch.cartesian_prod(*lattice).reshape(-1, 2)).clip(measurement.box)
-        most = max(most, rays_through(rays, min(grid.spacing)))
-    return most

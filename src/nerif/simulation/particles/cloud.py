@@ -13,7 +13,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerif.common.conventions import InputError
-from nerif.data.volume import Volume, describe
+from nerif.data.quantity_names import describe
+from nerif.data.volume import Volume
 from nerif.geometry import Box, Grid
 
 __all__ = ["DIAMETER", "Particles", "quality_factor", "spread"]

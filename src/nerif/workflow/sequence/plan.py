@@ -5,14 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from nerif.common.conventions import InputError
 from nerif.common.settings import Count, Positive, check_settings
-from nerif.data.measurement import Measurement
-from nerif.data.volume import QUANTITIES, quantities_of
+from nerif.data.quantity_names import QUANTITIES, quantities_of
 from nerif.physics.quantities import GasSettings
 from nerif.reconstruction.neural.neural import NeRIF
+
+if TYPE_CHECKING:
+    from nerif.data.measurement import Measurement
 
 __all__ = ["Event", "SequencePlan", "SequenceSettings"]
 

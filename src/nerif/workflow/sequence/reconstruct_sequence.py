@@ -14,7 +14,7 @@ from nerif.common.interruption import if_interrupted
 from nerif.common.locks import locked
 from nerif.data.measurement import Measurement
 from nerif.data.measurement_sequence import MeasurementSequence
-from nerif.data.volume import quantities_of
+from nerif.data.quantity_names import quantities_of
 from nerif.geometry import Grid
 from nerif.reconstruction.aperture import apply_aperture
 from nerif.reconstruction.bounds import field_bounds

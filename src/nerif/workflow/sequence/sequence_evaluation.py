@@ -12,7 +12,7 @@ from nerif.analysis.metrics import volume_errors
 from nerif.common.conventions import InputError
 from nerif.common.files import write_json
 from nerif.common.times import same_instants
-from nerif.data.volume import INDEX
+from nerif.data.quantity_names import INDEX
 from nerif.data.volume_sequence import VolumeSequence
 from nerif.forward.registry import ASSUMED, technique
 from nerif.geometry.body import contained

@@ -25,8 +25,9 @@ from nerif.data.measurement_file import BODIES, bodies_of
 from nerif.data.measurement_sequence import MeasurementSequence, add_frames, check_store
 from nerif.data.volume import Volume
 from nerif.data.volume_sequence import FIELDS, VolumeSequence, score_names
-from nerif.fields.network import Network, NetworkShape, NeuralField
+from nerif.fields.network import Network, NeuralField
 from nerif.fields.network_kinds import network_in
+from nerif.fields.network_shape import NetworkShape
 from nerif.geometry import Box, Grid
 from nerif.geometry.body import Body
 from nerif.geometry.symmetry import Symmetry

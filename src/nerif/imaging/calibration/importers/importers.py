@@ -8,20 +8,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
 
 import torch
-from annotated_types import Ge, Lt
 
 from nerif.common.conventions import InputError
 from nerif.common.files import check_file, ending
-from nerif.common.settings import Positive, check_settings
 from nerif.data.cameras_file import CalibratedCamera, check_camera, check_names, read_box
 from nerif.data.kinds import ARRAYS, CALIBRATION, IMAGES, reading_as
 from nerif.geometry import Box, Lens, Plane
 from nerif.geometry.distortion import POWERS
+from nerif.imaging.calibration.calibration_settings import ImportSettings
 from nerif.imaging.calibration.importers.colmap import COLMAP, read_colmap
 from nerif.imaging.calibration.importers.geometry_files import read_geometry
 from nerif.imaging.calibration.importers.matlab import read_matlab
@@ -32,57 +30,11 @@ from nerif.imaging.calibration.importers.yaml_files import ENDINGS as YAML
 from nerif.imaging.calibration.importers.yaml_files import read_yaml_files
 from nerif.imaging.readers.views import VIEWS
 
-__all__ = ["ImportSettings", "import_box", "import_cameras", "is_calibration"]
+__all__ = ["import_box", "import_cameras", "is_calibration"]
 
+STANDARD = ImportSettings()
 READERS = {".toml": read_tables, ".csv": read_csv, ".json": read_transforms}
 ENDINGS = (*READERS, *YAML, ".mat", ".npz", ORI)
-
-
-@dataclass(frozen=True)
-class ImportSettings:
-    """Properties of the cameras that the file of another program may lack."""
-
-    scale_mm: Positive | None = None
-    """Unit of length of the imported file, mm (default: 1; 1000 for files of ROS and kalibr, which are in metres)."""
-    pose: int = 1
-    """Number of the target image that defines the world frame, for MATLAB files with one pose per image."""
-    background_distance: float | None = None
-    """Distance from the origin to backgrounds whose planes are not in the file, across the optical axis, mm; also for
-    target images, and for --simple, where the origin is on the axis of the flow."""
-    image_size: tuple[int, int] | None = None
-    """Height and width of the images where the file lacks them, px."""
-    aperture_diameter: float | None = None
-    """Diameter of the entrance pupils (focal length / f-number), mm; overrides the file; 0: thin rays. Of telecentric
-    lenses: of the cone of rays at z_cam = 0, which calibration places at the origin. Also for target images."""
-    focus_distance: float | None = None
-    """Distance of the plane in focus along the optical axis, mm; default: that of the file, or the background."""
-    pose_sigma_mm: Annotated[float, Ge(0), Lt(math.inf)] | None = None
-    """Standard deviation of the camera positions, mm, the prior of reconstruct --refine; default with target images:
-    0.05 in addition to their noise; with --simple: 1."""
-    pose_sigma_deg: Annotated[float, Ge(0), Lt(math.inf)] | None = None
-    """Standard deviation of the camera rotations, degrees; default with target images: 0.005 in addition to their
-    noise; with --simple: 0.5."""
-
-    def __post_init__(self) -> None:
-        if self.focus_distance is not None and self.aperture_diameter is None:
-            raise InputError("expected together with aperture_diameter, got it alone", field="focus_distance")
-        _ = self.lens  # validates its numbers
-        check_settings(self)
-        if (self.pose_sigma_mm is None) != (self.pose_sigma_deg is None):
-            raise InputError("expected both or neither", field="pose_sigma_mm, pose_sigma_deg")
-
-    @property
-    def pose_sigma(self) -> tuple[float, float] | None:
-        """Standard deviations of the position (mm) and rotation (degrees) of cameras."""
-        if self.pose_sigma_mm is None or self.pose_sigma_deg is None:
-            return None
-        return self.pose_sigma_mm, self.pose_sigma_deg
-
-    @property
-    def lens(self) -> Lens | None:
-        """Lens of every camera, or None for thin rays or that of the file."""
-        lens = Lens(self.aperture_diameter or 0.0, self.focus_distance)
-        return lens if lens.diameter else None
 
 
 def is_calibration(path: Path) -> bool:
@@ -96,7 +48,7 @@ def is_calibration(path: Path) -> bool:
 
 def import_cameras(
     path: Path,
-    settings: ImportSettings = ImportSettings(),
+    settings: ImportSettings = STANDARD,
     only: Sequence[str] = (),
     say: Callable[[str], None] = lambda line: None,
 ) -> tuple[CalibratedCamera, ...]:
@@ -147,7 +99,7 @@ def _read(path: Path, settings: ImportSettings, say: Callable[[str], None]) -> t
     )
 
 
-def import_box(path: Path, settings: ImportSettings = ImportSettings()) -> Box | None:
+def import_box(path: Path, settings: ImportSettings = STANDARD) -> Box | None:
     """Read the box of a calibration, mm; None if it has none."""
     box = read_box(path) if ending(path) == ".toml" else None
     if box is None or settings.scale_mm is None:
