@@ -39,7 +39,7 @@ import functools, multiprocessing, os, signal, sys, types, warnings
 if __name__ == "__main__":
     # first all packages of others: on Windows they have other code
     import cv2, h5netcdf, matplotlib.figure, numba, PIL.Image, psutil, pydantic, rich.progress, scipy.stats
-    import torch, tyro, xarray
+    import torch, xarray
 
     # a file that is open or mapped can be neither replaced, renamed nor removed
     def closed_only(change, *paths, **more):

@@ -10,7 +10,7 @@ from contextlib import ExitStack, contextmanager, redirect_stderr
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 from nerif.cli.arguments import flag_value
 from nerif.cli.output import MONITOR
@@ -157,8 +157,9 @@ def read_with_preset(default: P, arguments: list[str], name: str, file: Path | N
     """Return the settings of a command that trains a network; its defaults are those of the preset."""
     chosen = setting_of("preset", arguments, "auto", file)
     first = PRESETS["fast"] if chosen == "auto" else preset(chosen)
-    settings = read_settings(replace(default, preset=chosen, reconstructor=first), arguments, name, file)
+    changes: dict[str, Any] = {"preset": chosen, "reconstructor": first}
+    settings = read_settings(replace(default, **changes), arguments, name, file)
     if chosen != "auto" or (best := preset("auto")) == first:  # whether there is a GPU is known to PyTorch only
         return settings
     with redirect_stderr(io.StringIO()):  # notes, for the second time
-        return read_settings(replace(default, preset=chosen, reconstructor=best), arguments, name, file)
+        return read_settings(replace(default, **changes | {"reconstructor": best}), arguments, name, file)

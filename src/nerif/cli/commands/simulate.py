@@ -42,7 +42,7 @@ def truth_path(out: Path) -> Path:
 
 def run(settings: Simulate) -> None:
     """Write the measurement, or a sequence, and the true field."""
-    from nerif.data.volume_file import write_netcdf
+    from nerif.data.volume import write_netcdf
 
     out, truth = settings.out, truth_path(settings.out)
     times = instants(settings.times) if settings.times else ()

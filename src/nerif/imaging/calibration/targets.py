@@ -118,7 +118,7 @@ class CalibrationTarget:
                 "looks the same turned by 180 degrees; or use ChArUco",
                 field="target",
             )
-        if self.kind == "charuco":
+        if self.kind == "charuco" and self.dictionary != DICTIONARY:
             import cv2
 
             if not hasattr(cv2.aruco, self.dictionary):
