@@ -42,7 +42,7 @@ GAUGES: dict[str, dict[str, Any]] = {
     "faces of the file": {},
     "face z-": {"ambient_faces": ("z-",)},
     "region ahead of the shock": {"ambient_region": (-14.0, 14.0, -14.0, 14.0, -15.0, -11.0)},
-    "probe": {"known": ((0.0, 0.0, -14.0, 1 + STREAM),)},
+    "probe": {"probes": ((0.0, 0.0, -14.0, 1 + STREAM),)},
     "face z-, z+ open": {"ambient_faces": ("z-",), "open_faces": ("z+",)},
     "face z-, all others open, grown 5 mm": {"ambient_faces": ("z-",), "open_faces": FACES, "extend_open_faces": 5.0},
     "face z-, all others open, grown 10 mm": {"ambient_faces": ("z-",), "open_faces": FACES, "extend_open_faces": 10.0},

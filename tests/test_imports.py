@@ -1,4 +1,4 @@
-"""What is loaded, and when: the core is light, and arguments are checked before PyTorch. Rooms and circles: make rooms."""
+"""What is loaded, and when: the core is light, arguments are checked without PyTorch. Rooms, circles: make rooms."""
 
 from __future__ import annotations
 
@@ -10,9 +10,8 @@ import pytest
 
 from nerif.cli.cli import main
 
-HEAVY = str.split(
-    "xarray matplotlib vtkmodules skimage rich safetensors scipy numba psutil cv2 tifffile imageio zarr dask distributed"
-)
+HEAVY = str.split("xarray matplotlib vtkmodules skimage rich safetensors scipy numba psutil cv2 tifffile imageio zarr")
+HEAVY += ["dask", "distributed"]
 STAGES = {
     "help": "main(['--help'])",
     "missing input": "for c in INPUTS: assert main([c, 'absent', '-o', 'x']) == 2",

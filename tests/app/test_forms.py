@@ -66,7 +66,7 @@ def test_what_is_right_only_beside_another_is_right():
 def test_nested_fields():
     form = form_of("nerif", "fast")
     errors = form.errors({"network.width": 0, "schedule": "constant"})
-    assert errors == {"network.width": "Expected at least 1, got 0"}
+    assert errors == {"network.width": "Expected 1 or more, got 0"}
     assert form.build({"network.width": 32}).reconstructor.network.width == 32
 
 

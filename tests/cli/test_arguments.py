@@ -47,6 +47,9 @@ def read(words: str, method: str = "nerif", more: str = "") -> Any:
         ("reconstruct m.nc -o r --set epochs=abc", "--epochs: expected a number, got 'abc'"),
         ("reconstruct m.nc -o r --set network.width", "--set: expected NAME=VALUE"),
         ("reconstruct m.nc -o r --set network.breadth=3", "--network.breadth: unknown option; did you mean"),
+        ("reconstruct m.nc -o r --method sart", "method: expected one of nerif, tikhonov, landweber, tv"),
+        ("reconstruct m.nc -o r --method tv --regularisation much", "expected auto or a number, got 'much'"),
+        ("reconstruct m.nc -o r --method tv --uncertainty quick", "expected one of off, fast, full, got 'quick'"),
         ("reconstruct m.nc -o r --max_steps 2.5", "--max-steps: expected a whole number, got '2.5'"),
         ("reconstruct m.nc -o r --max-steps -1", "--max-steps: expected 0 or more, got '-1'"),
         ("reconstruct m.nc -o r --max-steps", "--max-steps: expected INT, got none"),
@@ -89,7 +92,7 @@ def test_values_of_every_kind():
     assert (n.network.octave_decay, n.warm_up, n.betas, r.run.report) == (0.5, 3, (0.8, 0.9), False)
     r = read("m.nc --out r --known 0 0 -14 1.0003 1 2 3 1 --regularisation 0.5 --gas.composition None --no-hull", "tv")
     tv = r.reconstructor
-    assert (tv.known, tv.hull, tv.regularisation) == (((0, 0, -14, 1.0003), (1, 2, 3, 1)), False, 0.5)
+    assert (tv.probes, tv.hull, tv.regularisation) == (((0, 0, -14, 1.0003), (1, 2, 3, 1)), False, 0.5)
     words = "x --calibration c.toml -o m --frame-offset a -2 --frame-offset b 1"
     assert Displacement.read(words.split(), "displacement").frame_offset == {"a": -2, "b": 1}
     b = BodyInFlow.read(str.split("m.nc a.stl --unit cm b.stl --rotation 1 2 -3"), "body")
@@ -123,7 +126,7 @@ def test_former_names_are_valid_with_a_note(former, present, value, entry, capsy
     [
         ("learning_rat = 1.0", "unknown key 'learning_rat'; the nearest known one is 'learning_rate'"),
         ("[network]\nwidht = 3", "unknown key 'network.widht'; the nearest known one is 'network.width'"),
-        ("[network]\nwidth = 0", "width: expected at least 1, got 0"),
+        ("[network]\nwidth = 0", "network.width: expected 1 or more, got 0"),
         ('epochs = "many"', "epochs: expected a number, got 'many'"),
         ('epochs = "3"', "epochs: expected a number, got '3'"),
         ("max_steps = true", "max_steps: expected a whole number, got True"),
@@ -192,8 +195,8 @@ def test_help_shows_the_frequent_options_in_groups_and_all_that_people_set(metho
 
 
 def test_options_of_developers_are_those_of_the_training():
-    known = options(command_of("nerif")(MISSING, MISSING))
-    assert {name for name, option in known.items() if Developer in option.marks} == {*DEVELOPER}
+    every = options(command_of("nerif")(MISSING, MISSING))
+    assert {name for name, option in every.items() if Developer in option.marks} == {*DEVELOPER}
 
 
 @pytest.mark.parametrize("command", COMMANDS)

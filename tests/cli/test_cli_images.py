@@ -108,15 +108,15 @@ def test_reconstruction_from_images(experiment, tmp_path, refusal):
     withheld = measurement.names[1]
     words = ["reconstruct", experiment / "m.nc", "-o", out, "--from", "images", "--withhold", withheld]
     assert run(*words, "--max-steps", "40", "--voxels", "16", "--points-per-batch", "2048") == 0
-    assert tomllib.loads((out / "run.toml").read_text())["source"] == "images"
+    assert tomllib.loads((out / "run.toml").read_text())["from"] == "images"
     scores = {(v["name"], v["measured"]) for v in metrics_of(out)["views"] if v["withheld"]}
     assert scores == {(withheld, "displacement"), (withheld, "flow")}
     page = (out / "report.html").read_text()
     assert page.count("data:image/png") >= 3 * 3 * VIEWS  # measured, predicted, difference of u, v and flow
     settings = out / "run.toml"
-    settings.write_text(settings.read_text().replace('source = "images"', 'from = "displacements"'))
+    settings.write_text(settings.read_text().replace('from = "images"', 'from = "displacements"'))
     assert run("reconstruct", "--config", settings, "-o", tmp_path / "again", "--no-report") == 0
-    assert tomllib.loads((tmp_path / "again/run.toml").read_text())["source"] == "displacements"
+    assert tomllib.loads((tmp_path / "again/run.toml").read_text())["from"] == "displacements"
     assert "displacements" in refusal(*words[:4], "--force", "--from", "videos")
     replace(measurement, maps={}).write(tmp_path / "plain.nc")
     line = refusal("reconstruct", tmp_path / "plain.nc", "-o", tmp_path / "none", "--from", "images")

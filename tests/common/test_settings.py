@@ -9,14 +9,14 @@ from typing import Annotated, Literal
 import pytest
 from annotated_types import Ge, Le, Lt
 
-from nerif.common.settings import Count, NonNegative, Positive, check_settings
+from nerif.common.settings import Checked, Count, NonNegative, Positive
 from refusals import refused
 
 SHAPES = {"round": 1}
 
 
 @dataclass(frozen=True)
-class Example:
+class Example(Checked):
     norm: Literal["l2", "squared"] = "l2"
     weight: Literal["auto"] | Annotated[float, Ge(0), Lt(math.inf)] = "auto"
     sigma: Positive | None = None
@@ -26,9 +26,6 @@ class Example:
     names: tuple[str, ...] = ()
     note: str = ""
     outline: Literal[*SHAPES] = "round"  # type: ignore[valid-type]
-
-    def __post_init__(self) -> None:
-        check_settings(self)
 
 
 def test_valid_values():

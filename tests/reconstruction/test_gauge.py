@@ -50,10 +50,10 @@ def test_a_region_fixes_the_constant(measurement, ball, corner, method):
 @METHODS
 def test_a_known_point_fixes_the_constant(measurement, ball, probe, method):
     *place, index = probe
-    result = replace(method, known=(probe,))(measurement)
+    result = replace(method, probes=(probe,))(measurement)
     excess = float(result.field(torch.tensor([place]))[0])
     assert excess == pytest.approx(index - measurement.n_ambient, rel=0.02)
-    higher = replace(method, known=((*place, index + 1e-4),))(measurement)
+    higher = replace(method, probes=((*place, index + 1e-4),))(measurement)
     points = torch.tensor([measurement.box.centre, place])
     assert float((higher.field(points) - result.field(points)).mean()) == pytest.approx(1e-4, rel=0.1)
 
@@ -93,7 +93,7 @@ def test_a_gauge_that_cannot_be_is_refused(measurement, corner, probe):
     with refused("ambient_region"):
         replace(QUICK, ambient_region=(5.0, 0.0, 0.0, 1.0, 0.0, 1.0))
     with refused("known"):
-        replace(QUICK, known=((0.0, 0.0, 0.0, 2.7e-4),))
+        replace(QUICK, probes=((0.0, 0.0, 0.0, 2.7e-4),))
     with refused("known"):
         Gauge.of(measurement, [(1e3, 0.0, 0.0, 1.0)])
     body = cuboid((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
@@ -102,7 +102,7 @@ def test_a_gauge_that_cannot_be_is_refused(measurement, corner, probe):
     masked = replace(measurement, flow_mask=torch.ones(measurement.shape, dtype=torch.bool))
     masked.flow_mask[:, :8] = False
     with refused("known"):
-        replace(SMOOTH, known=(probe,))(masked)
+        replace(SMOOTH, probes=(probe,))(masked)
     with refused("ambient_faces"):
         QUICK(replace(measurement, ambient_faces=()))
 
@@ -118,4 +118,4 @@ def test_faces_that_are_stated_count_for_techniques_without_a_gauge(measurement)
     assert with_gauge(absorbing, QUICK).ambient_faces == ()
     assert with_gauge(absorbing, replace(QUICK, ambient_faces=("z-",))).ambient_faces == ("z-",)
     with refused("known"):
-        with_gauge(absorbing, replace(QUICK, known=((0.0, 0.0, 0.0, 1.0),)))
+        with_gauge(absorbing, replace(QUICK, probes=((0.0, 0.0, 0.0, 1.0),)))

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
+from annotated_types import Ge, Le
+
 from nerif.app.server.guard import ADDRESS
 from nerif.cli.settings import Settings, compute, read_settings
 from nerif.common.conventions import InputError
@@ -30,7 +32,7 @@ class App(Settings):
     demo: bool = False
     """Render a small experiment into a new folder (by default nerif-demo), with a guide that leads through all
     pages."""
-    port: int = 8620
+    port: Annotated[int, Ge(1), Le(65535)] = 8620
     """Port to listen on; if it is in use, the next free one."""
     host: str = "127.0.0.1"
     """Address to listen on. Any other than this machine's own needs --token: everyone with access and the token can run
@@ -47,8 +49,7 @@ class App(Settings):
     """Open the browser."""
 
     def __post_init__(self) -> None:
-        if not 1 <= self.port <= 65535:
-            raise InputError(f"expected 1 to 65535, got {self.port}", field="port")
+        super().__post_init__()
         for address in self.allowed_host:
             if not ADDRESS.fullmatch(address):
                 raise InputError(

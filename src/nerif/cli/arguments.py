@@ -87,27 +87,27 @@ def flag_value(words: list[str], name: str) -> str | None:
     return value
 
 
-def values_of(words: list[str], known: Mapping[str, Option]) -> dict[str, Any]:
+def values_of(words: list[str], fields: Mapping[str, Option]) -> dict[str, Any]:
     """Return the values of options by name, as words to be converted.
 
     Parameters
     ----------
-    known : options of the command, by name
+    fields : options of the command, by name
     """
     values: dict[str, Any] = {}
-    free = [option for option in known.values() if Positional in option.marks]
-    off = {option.off: option.name for option in known.values() if option.kind == "switch"}
+    free = [option for option in fields.values() if Positional in option.marks]
+    off = {option.off: option.name for option in fields.values() if option.kind == "switch"}
     for flag, rest in _given(words):
         if flag == "--set":
             name, _, value = (rest or [""])[0].partition("=")
             if not name or not value:
                 raise InputError(f"expected NAME=VALUE, such as network.width=128, got '{name}'", field=flag)
-            option, rest = _option(f"--{name}", known, all_options=True), rest[1:]
+            option, rest = _option(f"--{name}", fields, all_options=True), rest[1:]
             _put(values, option, value.split())
         elif flag in off:
             values[off[flag]] = False
         elif flag:
-            option = _option(flag, known)
+            option = _option(flag, fields)
             count = 0 if option.kind == "switch" else option.count
             _put(values, option, rest[:count] if option.kind != "switch" else ["true"])
             rest = [] if count is None else rest[count:]
@@ -119,11 +119,11 @@ def values_of(words: list[str], known: Mapping[str, Option]) -> dict[str, Any]:
     return values
 
 
-def present_name(name: str, known: Collection[str]) -> str:
+def present_name(name: str, fields: Collection[str]) -> str:
     """Return the name of an option, with underscores; a note on standard error where another one takes its place."""
     name = name.replace("-", "_")
     now = FORMER.get(name, name)
-    if name in known or now not in known:
+    if name in fields or now not in fields:
         return name
     old, new = (word.replace("_", "-") for word in (name, now))
     print(f"nerif: note: --{old} is now --{new}; the former name is valid until nerif 1.0", file=sys.stderr)
@@ -146,11 +146,11 @@ def _given(words: list[str]) -> Iterator[tuple[str, list[str]]]:
     yield flag, rest
 
 
-def _option(flag: str, known: Mapping[str, Option], all_options: bool = False) -> Option:
+def _option(flag: str, fields: Mapping[str, Option], all_options: bool = False) -> Option:
     """Return an option by its name on the command line; those of developers among all options only."""
-    option = known.get(present_name(flag[2:], known))
+    option = fields.get(present_name(flag[2:], fields))
     if option is None or Positional in option.marks or not flag.startswith("--"):
-        flags = [option.flag for option in known.values() if Positional not in option.marks]
+        flags = [option.flag for option in fields.values() if Positional not in option.marks]
         nearest = difflib.get_close_matches(flag, flags, n=1)
         guess = f"; did you mean {nearest[0]}?" if nearest else ""
         raise InputError(f"unknown option{guess}", field=flag)

@@ -36,19 +36,19 @@ def help_text(record: Any, prog: str, everything: bool = False) -> str:
     record : settings of the command, with their defaults
     everything : also the options that are rarely set
     """
-    known = {name: option for name, option in options(record).items() if Developer not in option.marks}
-    places = [option for option in known.values() if Positional in option.marks]
-    needed = [option for option in known.values() if option.default is MISSING and option not in places]
+    fields = {name: option for name, option in options(record).items() if Developer not in option.marks}
+    places = [option for option in fields.values() if Positional in option.marks]
+    needed = [option for option in fields.values() if option.default is MISSING and option not in places]
     words = [option.name.upper() if option.default is MISSING else f"[{option.name.upper()}]" for option in places]
     words += [f"{option.flag} {option.name.upper()}" for option in needed]
     lines = [f"usage: {' '.join([prog, *words])} [options]", ""]
     for paragraph in (inspect.getdoc(type(record)) or "").split("\n\n"):
         lines += [*textwrap.wrap(paragraph, WIDTH), ""]
     if few := record.brief and not everything:
-        groups = {group: [known[name] for name in names if name in known] for group, names in GROUPS.items()}
+        groups = {group: [fields[name] for name in names if name in fields] for group, names in GROUPS.items()}
     else:
         groups = {"arguments": places, "options": []}
-        for option in (option for option in known.values() if option not in places):
+        for option in (option for option in fields.values() if option not in places):
             groups.setdefault(option.name.rpartition(".")[0] or "options", []).append(option)
     for group, members in groups.items():
         if members:

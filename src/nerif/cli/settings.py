@@ -77,12 +77,12 @@ def read_settings(default: S, arguments: list[str], name: str, file: Path | None
     if {"-h", "--help"} & {*arguments}:
         print(help_text(default, f"nerif {name}", everything=arguments[-1] == "all"))
         raise SystemExit(0)
-    known = options(default)
+    fields = options(default)
     if file := _config(arguments) or file:
-        entries = {present_name(key, known): value for key, value in _settings_file(file).items()}
+        entries = {present_name(key, fields): value for key, value in _settings_file(file).items()}
         default = merge(default, entries, file)
     try:
-        settings = merge(default, values_of(arguments, known), file=False)
+        settings = merge(default, values_of(arguments, fields), file=False)
         for option in options(settings).values():
             if option.default is MISSING:
                 field = option.name if Positional in option.marks else option.flag

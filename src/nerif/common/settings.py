@@ -32,9 +32,9 @@ from nerif.common.conventions import InputError
 from nerif.common.files import check_known
 
 __all__ = [
-    "FORMER", "MISSING", "Append", "Count", "Developer", "Flat", "Length", "NoOption", "NonNegative", "Option",
-    "OptionName", "Positional", "Positive", "check_settings", "converted", "merge", "options",
-    "with_present_names",
+    "FORMER", "MISSING", "Append", "Checked", "Count", "Developer", "Flat", "Length", "Natural", "NoOption",
+    "NonNegative", "Option", "OptionName", "Positional", "Positive", "check_settings", "converted", "merge",
+    "options", "with_present_names",
 ]  # fmt: skip
 
 T = TypeVar("T")
@@ -42,6 +42,7 @@ T = TypeVar("T")
 Positive = Annotated[float, Gt(0)]
 NonNegative = Annotated[float, Ge(0)]
 Count = Annotated[int, Ge(1)]
+Natural = Annotated[int, Ge(0)]
 Length = Annotated[float, Gt(0), Lt(math.inf)]
 
 MISSING: Any = dataclasses.MISSING
@@ -78,8 +79,16 @@ def check_settings(settings: Any) -> None:
     """Convert every field of a frozen dataclass to the type of its annotation; InputError if a value is invalid."""
     for name, hint in _hints(type(settings)).items():
         value = getattr(settings, name)
-        if value is not MISSING and not dataclasses.is_dataclass(_plain(hint)):
+        if value is not MISSING and _holds_values(hint):
             object.__setattr__(settings, name, converted(hint, value, name))
+
+
+@dataclass(frozen=True)
+class Checked:
+    """A record whose fields are converted and checked when it is made."""
+
+    def __post_init__(self) -> None:
+        check_settings(self)
 
 
 def converted(hint: Any, value: Any, name: str, file: bool = False) -> Any:
@@ -233,8 +242,8 @@ def _options(record: Any, prefix: str = "", place: tuple[str, ...] = ()) -> Iter
         if dataclasses.is_dataclass(value):
             yield from _options(value, prefix if Flat in marks else f"{prefix}{name}.", (*place, name))
             continue
-        shown = next((mark.name for mark in marks if isinstance(mark, OptionName)), name)
-        yield Option(prefix + shown, (*place, name), hint, value, marks, type(record))
+        label = next((mark.name for mark in marks if isinstance(mark, OptionName)), name)
+        yield Option(prefix + label, (*place, name), hint, value, marks, type(record))
 
 
 def merge(record: T, values: Mapping[str, Any], place: object = "", file: bool = True) -> T:
@@ -245,23 +254,23 @@ def merge(record: T, values: Mapping[str, Any], place: object = "", file: bool =
     place : file in which the values stand, named by an InputError
     file : whether they are values of a file or form; else words of the command line
     """
-    known, changes = options(record), dict[tuple[str, ...], Any]()
-    values = dict(_flattened(values, known))
-    check_known(values, known, str(place))
+    fields, changes = options(record), dict[tuple[str, ...], Any]()
+    values = dict(_flattened(values, fields))
+    check_known(values, fields, str(place))
     try:
         for name, value in values.items():
-            option = known[name]
+            option = fields[name]
             changes[option.place] = converted(option.hint, value, name if file else option.flag, file)
         return _replaced(record, changes)
     except InputError as error:
         raise error.inside(place) if place else error from None
 
 
-def _flattened(values: Mapping[str, Any], known: Mapping[str, Option], prefix: str = "") -> Iterator[tuple[str, Any]]:
+def _flattened(values: Mapping[str, Any], fields: Mapping[str, Option], prefix: str = "") -> Iterator[tuple[str, Any]]:
     for name, value in values.items():
         name = prefix + name.replace("-", "_")
-        if isinstance(value, Mapping) and name not in known:
-            yield from _flattened(value, known, f"{name}.")
+        if isinstance(value, Mapping) and name not in fields:
+            yield from _flattened(value, fields, f"{name}.")
         else:
             yield name, value
 
@@ -292,6 +301,18 @@ def _alternatives(hint: Any) -> list[Any]:
     if typing.get_origin(hint) in (typing.Union, types.UnionType):
         return [part for argument in typing.get_args(hint) for part in _alternatives(argument)]
     return [hint]
+
+
+def _holds_values(hint: Any) -> bool:
+    """Whether a type is that of a setting: numbers, texts, paths, choices, and tuples and tables of these."""
+    for part in _alternatives(hint):
+        inner = typing.get_args(part)
+        if typing.get_origin(part) in (tuple, dict):
+            if not all(each is Ellipsis or _holds_values(each) for each in inner):
+                return False
+        elif typing.get_origin(part) is not Literal and part not in (*VALUES, types.NoneType):
+            return False
+    return True
 
 
 def _group(hint: Any) -> int:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal
 
 from nerif.common.conventions import InputError
-from nerif.common.settings import Developer, check_settings
+from nerif.common.settings import Count, Developer, Natural, check_settings
 
 __all__ = ["DIRECTIONS", "NetworkShape", "encoded_width"]
 
@@ -33,17 +33,17 @@ def encoded_width(octaves: int, directions: int) -> int:
 class NetworkShape:
     """Size of the network."""
 
-    depth: int = 4
+    depth: Count = 4
     """Hidden layers before the heads (paper: 7)."""
-    width: int = 96
+    width: Count = 96
     """Neurons per hidden layer (paper: 256)."""
-    octaves: int = 5
+    octaves: Natural = 5
     """N of the sinusoidal encoding; octaves beyond the fifth are weighted down, see Network."""
     directions: int = 13
     """Directions of the waves of each octave: 3 axes (the paper's), 9 with face diagonals, 13 with space diagonals."""
-    skip: int = 0
+    skip: Natural = 0
     """Layer to whose output the encoding is joined (paper: 4); 0 for none."""
-    head_width: int = 0
+    head_width: Natural = 0
     """Neurons of each head (paper: 64); 0 for one linear output."""
     gradient_head: bool = False
     """Whether the three heads for grad(n) exist."""
@@ -58,9 +58,6 @@ class NetworkShape:
             raise InputError(
                 f"expected one of {', '.join(map(str, DIRECTIONS))}, got {self.directions}", field="directions"
             )
-        for name, least in (("depth", 1), ("width", 1), ("octaves", 0), ("skip", 0), ("head_width", 0)):
-            if getattr(self, name) < least:
-                raise InputError(f"expected at least {least}, got {getattr(self, name)}", field=name)
 
     def without_waves_below(self, length: float) -> NetworkShape:
         """Return the shape without octaves with wavelengths 2^(1 - k) below a length; one octave stays."""

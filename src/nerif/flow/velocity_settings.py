@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from annotated_types import Ge, Gt, Lt
 
-from nerif.common.settings import Count, Positive, check_settings
+from nerif.common.settings import Checked, Count, Positive
 
 __all__ = ["MIN_VOXELS", "PHYSICS", "VelocitySettings"]
 
@@ -17,7 +17,7 @@ MIN_VOXELS = 8  # along the longest edge of the velocity
 
 
 @dataclass(frozen=True)
-class VelocitySettings:
+class VelocitySettings(Checked):
     """Settings of the velocity of a film."""
 
     physics: Literal[*PHYSICS] = "boussinesq"  # type: ignore[valid-type]
@@ -44,6 +44,3 @@ class VelocitySettings:
     """Samples of the flow, from which standard deviations are computed (0: none)."""
     sample_iterations: Count = 40
     """Iterations of each sample."""
-
-    def __post_init__(self) -> None:
-        check_settings(self)

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from annotated_types import Ge, Lt
 
 from nerif.common.conventions import AMBIENT_INDEX, DEFAULT_AMBIENT_FACES
-from nerif.common.settings import NonNegative, Positive, check_settings
+from nerif.common.settings import Checked, NonNegative, Positive
 
 __all__ = ["DisplacementSettings", "MaskSettings", "Surroundings"]
 
@@ -17,7 +17,7 @@ REACH = {"deepflow": 1.5, "dis": 1.5, "tvl1": 1.3, "ilk": 1.6, "correlation": 1.
 
 
 @dataclass(frozen=True)
-class DisplacementSettings:
+class DisplacementSettings(Checked):
     """Settings of the displacement measurement."""
 
     method: Literal[*REACH] = "correlation"  # type: ignore[valid-type]
@@ -34,9 +34,6 @@ class DisplacementSettings:
     min_correlation: Annotated[float, Ge(-1), Lt(1)] = 0.5
     """Pixels with a lower local correlation of flow image and warped reference are not valid."""
 
-    def __post_init__(self) -> None:
-        check_settings(self)
-
     @property
     def reach(self) -> float:
         """Standard deviation of the averaging window of the method, px."""
@@ -44,7 +41,7 @@ class DisplacementSettings:
 
 
 @dataclass(frozen=True)
-class MaskSettings:
+class MaskSettings(Checked):
     """Settings of a flow mask by threshold."""
 
     threshold: NonNegative = 4.0
@@ -55,9 +52,6 @@ class MaskSettings:
     """Islands and holes of fewer pixels are removed."""
     grow: Annotated[int, Ge(0)] = 3
     """Pixels added all around, so that the mask includes the edge of the flow."""
-
-    def __post_init__(self) -> None:
-        check_settings(self)
 
 
 @dataclass(frozen=True)

@@ -41,10 +41,10 @@ def with_gauge(measurement: Measurement, settings: SharedSettings) -> Measuremen
     Settings that state any of the two, or probes, replace both. The faces of the measurement itself count only if a
     technique needs them.
     """
-    if not (settings.ambient_faces or settings.ambient_region or settings.known):
+    if not (settings.ambient_faces or settings.ambient_region or settings.probes):
         faces = ambient_faces(measurement)
         return measurement if faces == measurement.ambient_faces else replace(measurement, ambient_faces=faces)
-    if settings.known and measurement.quantity != INDEX:
+    if settings.probes and measurement.quantity != INDEX:
         raise InputError(f"expected none for {measurement.quantity}, got points with an index", field="known")
     return replace(measurement, ambient_faces=settings.ambient_faces, ambient_region=settings.ambient_region)
 

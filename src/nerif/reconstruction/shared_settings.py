@@ -61,7 +61,7 @@ class SharedSettings(Reconstructor):
     ambient_region: Region | None = None
     """Region with ambient index, x0 x1 y0 y1 z0 z1 in mm, such as the stream ahead of a shock; in place of the faces
     of the measurement, unless --ambient-faces names some."""
-    known: tuple[tuple[float, float, float, float], ...] = ()
+    probes: Annotated[tuple[tuple[float, float, float, float], ...], OptionName("known")] = ()
     """Points x y z in mm with the refractive index there, as 5 0 -20 1.000271; in place of the faces of
     the measurement, too."""
     open_faces: tuple[str, ...] = ()
@@ -77,6 +77,6 @@ class SharedSettings(Reconstructor):
         parse_faces(self.ambient_faces)
         if self.ambient_region is not None:
             check_region(self.ambient_region)
-        for *_, index in self.known:
+        for *_, index in self.probes:
             ambient_index(index, "known")
         parse_faces(self.open_faces, "open_faces")

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from nerif.common.conventions import InputError
-from nerif.common.settings import check_settings
+from nerif.common.settings import Positive, check_settings
 
 __all__ = ["MovieSettings"]
 
@@ -27,12 +27,10 @@ class MovieSettings:
     """Direction of the viewpoint around z, degrees."""
     elevation: float = 20.0
     """Height of the viewpoint, degrees."""
-    frames_per_second: float = 20.0
+    frames_per_second: Positive = 20.0
     """Frames per second of the movie."""
 
     def __post_init__(self) -> None:
         check_settings(self)
         if min(self.size) < 16 or any(s % 2 for s in self.size):
             raise InputError(f"expected an even width and height of 16 px or more, got {self.size}", field="size")
-        if not self.frames_per_second > 0:
-            raise InputError(f"expected a positive number, got {self.frames_per_second}", field="frames_per_second")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 from annotated_types import Ge, Le
 
-from nerif.common.settings import NonNegative, Positive, check_settings
+from nerif.common.settings import Checked, NonNegative, Positive
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -18,7 +18,7 @@ __all__ = ["ExperimentSettings", "Sensor"]
 
 
 @dataclass(frozen=True)
-class Sensor:
+class Sensor(Checked):
     """A sensor: photons to counts."""
 
     bits: Annotated[int, Ge(8), Le(16)] = 12
@@ -29,9 +29,6 @@ class Sensor:
     """Electrons at full scale, which determine the shot noise (0: none)."""
     read_noise: NonNegative = 10.0
     """Standard deviation of the read noise, electrons."""
-
-    def __post_init__(self) -> None:
-        check_settings(self)
 
     def expose(self, light: Float[Tensor, "row column"], seed: int) -> np.ndarray:
         """Return counts of light from 0 (black) to 1 (white paper): shot noise, read noise, rounding, saturation."""

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from annotated_types import Ge
 
-from nerif.common.settings import NonNegative, check_settings
+from nerif.common.settings import Checked, NonNegative
 from nerif.physics.quantities import GasSettings
 
 __all__ = ["AUTO", "NONE", "Run"]
@@ -19,7 +19,7 @@ NONE: tuple[str, ...] = ("none",)
 
 
 @dataclass(frozen=True)
-class Run:
+class Run(Checked):
     """Settings of a reconstruction into a directory, in addition to those of the method."""
 
     withhold: tuple[str, ...] = AUTO
@@ -47,6 +47,3 @@ class Run:
     same result to the last digit."""
     gas: GasSettings = field(default_factory=GasSettings)
     """Gas for density and temperature."""
-
-    def __post_init__(self) -> None:
-        check_settings(self)

@@ -155,11 +155,11 @@ def main(arguments: list[str]) -> None:
 
 def read_with_preset(default: P, arguments: list[str], name: str, file: Path | None = None) -> P:
     """Return the settings of a command that trains a network; its defaults are those of the preset."""
-    chosen = setting_of("preset", arguments, "auto", file)
-    first = PRESETS["fast"] if chosen == "auto" else preset(chosen)
-    changes: dict[str, Any] = {"preset": chosen, "reconstructor": first}
+    choice = setting_of("preset", arguments, "auto", file)
+    first = PRESETS["fast"] if choice == "auto" else preset(choice)
+    changes: dict[str, Any] = {"preset": choice, "reconstructor": first}
     settings = read_settings(replace(default, **changes), arguments, name, file)
-    if chosen != "auto" or (best := preset("auto")) == first:  # whether there is a GPU is known to PyTorch only
+    if choice != "auto" or (best := preset("auto")) == first:  # whether there is a GPU is known to PyTorch only
         return settings
     with redirect_stderr(io.StringIO()):  # notes, for the second time
         return read_settings(replace(default, **changes | {"reconstructor": best}), arguments, name, file)

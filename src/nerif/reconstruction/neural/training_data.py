@@ -122,7 +122,7 @@ class TrainingData:
         self.shape, self.samples = settings.network, settings.samples
         self.settings, self.measurement = settings, measurement
         self.coarsest = coarsest_edge(measurement) if coarsest is None else coarsest
-        self.gauge = Gauge.of(measurement, settings.known)
+        self.gauge = Gauge.of(measurement, settings.probes)
         self.bounds = field_bounds(measurement, settings.lower, settings.upper)
         self.axis = axis_of(settings, measurement)
         self.lens_rays = lens_rays(measurement, settings.lens_rays)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from annotated_types import Ge, Gt
 
 from nerif.common.conventions import InputError
-from nerif.common.settings import Developer, NonNegative, Positive
+from nerif.common.settings import Checked, Developer, NonNegative, Positive
 from nerif.fields.network_shape import NetworkShape
 from nerif.forward.model_names import AUTO, MODEL_NAMES
 from nerif.geometry.symmetry_names import NO_SYMMETRY
@@ -22,24 +22,22 @@ __all__ = ["LossWeights", "TrainingSettings"]
 
 
 @dataclass(frozen=True)
-class LossWeights:
+class LossWeights(Checked):
     """Weights of the terms of the loss."""
 
-    consistency: float = 0.0
+    consistency: NonNegative = 0.0
     """|grad(n)_AD - grad(n)_net| over sample points (paper: 1)."""
-    numerical: float = 0.0
+    numerical: NonNegative = 0.0
     """|d_ND - d| over rays (paper: 1)."""
-    head: float = 0.0
+    head: NonNegative = 0.0
     """|d_net - d| over rays (paper: 1)."""
-    automatic: float = 1.0
+    automatic: NonNegative = 1.0
     """|d_AD - d| over rays (paper: 0)."""
-    gauge: float = 1.0
+    gauge: NonNegative = 1.0
     """N over the ambient region."""
 
     def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if not value >= 0:
-                raise InputError(f"expected 0 or more, got {value}", field=f"weight of the {name} term")
+        super().__post_init__()
         if self.numerical + self.head + self.automatic == 0:
             raise InputError("expected a positive numerical, head or automatic weight, got none", field="loss weights")
 

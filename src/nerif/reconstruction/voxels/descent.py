@@ -78,7 +78,7 @@ class VoxelRun:
         measurement = with_gauge(apply_aperture(measurement, settings.aperture), settings)
         settings, _ = settings.resolved(measurement)
         self.settings, self.measurement, self.on_step, self.start = settings, measurement, on_step, start
-        check_gauge(measurement, bool(settings.known), settings.hull)
+        check_gauge(measurement, bool(settings.probes), settings.hull)
         self.axis = axis_of(settings, measurement)
         dtype = getattr(torch, settings.precision)
         device = resolve_device(settings.device)
@@ -128,17 +128,17 @@ class VoxelRun:
     def _gauge(self) -> Gauge | None:
         """Where the field is known, if that alone fixes its constant: the solution is shifted to it."""
         pinned = self.layout.faces or (self.free is not None and not bool(self.free.all()))
-        if pinned and self.settings.known:
+        if pinned and self.settings.probes:
             raise InputError(
                 "expected no ambient faces, region or masks beside probes for a voxel method, which shifts its "
                 "field to them; leave one of the two out, or take --method nerif",
                 field="known",
             )
-        if self.settings.known and self.bounds is not None:
+        if self.settings.probes and self.bounds is not None:
             raise InputError("expected no bounds beside probes for a voxel method, got some", field="known")
         if pinned or self.bounds is not None or not is_open(self.measurement):
             return None
-        return Gauge.of(self.measurement, self.settings.known, self.settings.hull)
+        return Gauge.of(self.measurement, self.settings.probes, self.settings.hull)
 
     # -- levels ----------------------------------------------------------------------------------------------------
 

@@ -12,7 +12,9 @@ import math
 from abc import abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Annotated, ClassVar
+
+from annotated_types import Gt, Le
 
 from nerif.common.conventions import InputError
 from nerif.reconstruction.voxels.voxel_reconstructor import VoxelReconstructor
@@ -102,15 +104,10 @@ class MART(Multiplicative):
     """
 
     title: ClassVar[str] = "MART"
-    relaxation: float = 1.0
+    relaxation: Annotated[float, Gt(0), Le(1)] = 1.0
     """Exponent mu; above 0, at most 1."""
     iterations: int = 10
     """Maximum iterations, each with one update per view."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not 0 < self.relaxation <= 1:
-            raise InputError(f"expected above 0 and at most 1, got {self.relaxation}", field="relaxation")
 
     def memory_bytes(self, measurement: Measurement, grid: Grid, device: str = "cpu") -> int:
         """Return the memory of a run, with an operator and a reach for every view."""

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
-from nerif.common.conventions import InputError
+from nerif.common.settings import Count, Positive
 from nerif.reconstruction.voxels.voxel_reconstructor import WeightedVoxelReconstructor
 
 if TYPE_CHECKING:
@@ -33,19 +33,12 @@ class TotalVariation(WeightedVoxelReconstructor):
 
     title: ClassVar[str] = "total variation"
     detailed: ClassVar[bool] = True
-    softness: float = 0.1
+    softness: Positive = 0.1
     """Gradient, in units of the field's own scale per box edge, below which the penalty is quadratic."""
-    round: int = 10
+    round: Count = 10
     """Conjugate-gradient iterations between new weights."""
-    iterations: int = 60
+    iterations: Count = 60
     """Maximum iterations on each grid and with each weight."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not self.softness > 0:
-            raise InputError(f"expected above 0, got {self.softness}", field="softness")
-        if self.round < 1:
-            raise InputError(f"expected at least 1 iteration, got {self.round}", field="round")
 
     @property
     def patience(self) -> int:
