@@ -23,6 +23,7 @@ from nerif.fields.voxel_field import VoxelField
 from nerif.fields.walls import WallNetwork
 from nerif.forward.forward_model import ForwardModel
 from nerif.forward.images import Images
+from nerif.forward.model_names import AUTO
 from nerif.forward.path_integral import LENS_RAYS, FieldProjector, PathIntegral, project
 from nerif.forward.ray_tracing import CurvedRays
 from nerif.forward.registry import ASSUMED, TECHNIQUES, check_simulated, forward_model, forward_models
