@@ -18,17 +18,15 @@ from nerif.fields.voxel_field import VoxelField
 from nerif.reconstruction.field_files import read_field
 
 TINY = str.split("--image-size 18 22 --pixel-pitch 0.2 --views 5 --steps 40 --truth-voxels 16")
-TESTED = ["tikhonov", "landweber", "tv"]
 
 
 @pytest.fixture(scope="module")
 def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a simulated measurement and a reconstruction of it by each method."""
+    """A folder with a simulated measurement and a reconstruction of it."""
     folder = tmp_path_factory.mktemp("methods")
     assert run("simulate", "--phantom", "gaussians", "--noise", "0.05", "-o", folder / "m.nc", *TINY) == 0
-    for method in TESTED:
-        words = ["--method", method, "-o", folder / method, "--withhold", "85deg", "--voxels", "14"]
-        assert run("reconstruct", folder / "m.nc", *words, "--iterations", "20", "--no-report") == 0
+    words = ["--method", "tv", "-o", folder / "tv", *str.split("--withhold 85deg --voxels 14 --iterations 20 --no-report")]
+    assert run("reconstruct", folder / "m.nc", *words) == 0
     return folder
 
 
@@ -37,9 +35,8 @@ def history_of(result: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-@pytest.mark.parametrize("method", TESTED)
-def test_result_directory_and_its_use(work, tmp_path, capsys, method):
-    result = shutil.copytree(work / method, tmp_path / "r")
+def test_result_directory_and_its_use(work, tmp_path, capsys):
+    result = shutil.copytree(work / "tv", tmp_path / "r")
     assert isinstance(read_field(result)[0], VoxelField)
     metrics = metrics_of(result)
     assert [v["name"] for v in metrics["views"] if v["withheld"]] == ["85deg"]
@@ -50,7 +47,7 @@ def test_result_directory_and_its_use(work, tmp_path, capsys, method):
         assert volume.index_excess.shape == (14, 14, 14)
         assert {"n", "density"} <= set(volume)
     settings = tomllib.loads((result / "run.toml").read_text())
-    assert (settings["method"], settings["voxels"]) == (method, 14)
+    assert (settings["method"], settings["voxels"]) == ("tv", 14)
     rows = history_of(result)
     assert float(rows[-1]["residual"]) < float(rows[0]["residual"])
     assert float(rows[-1]["voxels"]) == 14
