@@ -25,8 +25,8 @@ def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a simulated measurement and a reconstruction of it."""
     folder = tmp_path_factory.mktemp("methods")
     assert run("simulate", "--phantom", "gaussians", "--noise", "0.05", "-o", folder / "m.nc", *TINY) == 0
-    words = ["--method", "tv", "-o", folder / "tv", *str.split("--withhold 85deg --voxels 14 --iterations 20 --no-report")]
-    assert run("reconstruct", folder / "m.nc", *words) == 0
+    words = str.split("--method tv --withhold 85deg --voxels 14 --iterations 20 --no-report")
+    assert run("reconstruct", folder / "m.nc", "-o", folder / "tv", *words) == 0
     return folder
 
 
