@@ -12,7 +12,7 @@ from annotated_types import Ge, Lt
 
 from nerif.common.conventions import AMBIENT_INDEX, DEFAULT_AMBIENT_FACES, InputError
 from nerif.common.files import ending
-from nerif.common.settings import Count, check_settings
+from nerif.common.settings import Count, NonNegative, check_settings
 from nerif.data.quantity_names import INDEX
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ class Simulation:
     """Data of a pixel: deflection, absorption, emission or interferometry; several if they share one field."""
     peak: Finite = 0.0
     """Largest extinction or emission, 1/mm, that a phantom is scaled to; 0 for one that gives about 1 along a ray."""
-    noise: float = 0.0
+    noise: NonNegative = 0.0
     """Standard deviation of the noise as a share of the rms over rays that cross the box."""
     counts: Finite = 0.0
     """Detected quanta, for shot noise instead: without the medium (absorption) or where it is brightest."""
