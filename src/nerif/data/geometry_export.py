@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -16,8 +17,10 @@ from nerif.geometry.tigre import tigre_of
 
 __all__ = ["PROGRAMS", "export_geometry"]
 
-PROGRAMS = ("astra", "tigre")
-"""Programs for whose geometry there is an export."""
+PROGRAMS: dict[str, Callable[..., dict[str, Any]]] = {
+    "astra": lambda cameras, size, grid, say: astra_of(cameras, size, grid), "tigre": tigre_of,
+}  # fmt: skip
+"""The arrays of the geometry for each tomography program."""
 
 
 def export_geometry(
@@ -29,9 +32,8 @@ def export_geometry(
         raise InputError(f"expected {' or '.join(PROGRAMS)}, got '{program}'", field="format")
     if ending(path) != ".npz":
         raise InputError(f"expected a name ending in .npz for the geometry of {program}, got '{path}'", field="out")
-    cameras, (_, rows, columns) = measurement.cameras, measurement.shape
-    size = (rows, columns)
-    arrays = astra_of(cameras, size, grid) if program == "astra" else tigre_of(cameras, size, grid, say)
+    cameras, (_, *size) = measurement.cameras, measurement.shape
+    arrays = PROGRAMS[program](cameras, tuple(size), grid, say)
     if names := [c.name for c in cameras if c.lens is not None and c.lens.wide]:
         say(f"apertures and windows are no part of the geometry, whose rays are thin: {', '.join(names)}")
     arrays |= {"views": np.array(measurement.names), "image_size": np.array([c.image_size for c in cameras])}
