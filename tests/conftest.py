@@ -113,7 +113,7 @@ def measurement(ball: Field, cameras: tuple[Camera, ...], box: Box) -> Measureme
 
 @pytest.fixture
 def slow_clock(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
-    """Let every look at the clock of a training come so many seconds after the one before."""
+    """Let every reading of a training's clock be a number of seconds after the one before."""
 
     def set_to(seconds: float) -> None:
         ticks = itertools.count()

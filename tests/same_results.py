@@ -76,9 +76,9 @@ def numbers(folder: Path) -> dict[str, np.ndarray]:
     arrays: dict[str, np.ndarray] = {}
     for path in sorted(folder.rglob("*.nc")):
         with h5py.File(path) as file:
-            found: dict[str, np.ndarray] = {}
-            file.visititems(lambda n, d, found=found: found.update({n: d[()]}) if isinstance(d, h5py.Dataset) else None)
-        arrays |= {f"{path.relative_to(folder)}: {name}": value for name, value in found.items()}
+            leaf: dict[str, np.ndarray] = {}
+            file.visititems(lambda n, d, leaf=leaf: leaf.update({n: d[()]}) if isinstance(d, h5py.Dataset) else None)
+        arrays |= {f"{path.relative_to(folder)}: {name}": value for name, value in leaf.items()}
     for path in sorted(folder.rglob("history.csv")):
         with path.open() as file:
             rows = [row for row in csv.DictReader(file) if not of_clock(row)]

@@ -24,7 +24,7 @@ COLD = NeRIF(
 
 
 def simulated(out: Path, frames: int) -> Path:
-    """Simulate so many frames, a tenth of a millisecond apart."""
+    """Simulate a number of frames, a tenth of a millisecond apart."""
     times = f"0:{(frames - 1) * 1e-4}:{frames}"
     assert main(["simulate", "--phantom", "flame", "--times", times, "--noise", "0.05", "-o", str(out), *RIG]) == 0
     return out

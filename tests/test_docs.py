@@ -34,18 +34,18 @@ class Page(HTMLParser):
         self.feed(text)
 
     def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
-        given = {name: value or "" for name, value in attributes}
-        self.ids |= {given[name] for name in ("id", "name") if name in given}
-        if "src" in given:
-            self.loads.append(given["src"])
-        if tag == "link" and given.get("rel") not in ("index", "search", "next", "prev", "canonical"):
-            self.loads.append(given.get("href", ""))
-        if tag == "a" and "href" in given:
-            self.links.append(given["href"])
+        values = {name: value or "" for name, value in attributes}
+        self.ids |= {values[name] for name in ("id", "name") if name in values}
+        if "src" in values:
+            self.loads.append(values["src"])
+        if tag == "link" and values.get("rel") not in ("index", "search", "next", "prev", "canonical"):
+            self.loads.append(values.get("href", ""))
+        if tag == "a" and "href" in values:
+            self.links.append(values["href"])
 
 
 @pytest.mark.parametrize("page", sorted(p.name for p in (ROOT / "docs" / "api").glob("*.md")))
-def test_pages_of_the_api_tell_of_what_is_there(page: str) -> None:
+def test_pages_of_the_api_list_what_is_there(page: str) -> None:
     names = re.findall(r"(?:auto\w+::|% modules) (\S+)", (ROOT / "docs" / "api" / page).read_text())
     assert names
     for name in names:

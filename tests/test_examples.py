@@ -159,10 +159,10 @@ def test_shock_cells_are_as_long_as_they_were_made():
     jet = runpy.run_path(str(EXAMPLES / "jet.py"))
     h, random = np.linspace(0, 73, 400), np.random.default_rng(0)
     signal = np.cos(2 * np.pi * h / 24.4) + 0.3 * np.sin(4 * np.pi * h / 24.4) + 0.01 * h
-    found = jet["spacing"](h, signal + 0.2 * random.standard_normal(400), 10.0, 40.0)
-    assert abs(found.length - 24.4) < 4 * found.sigma
-    assert 0.01 < found.sigma < 0.5
-    assert found.explained > 0.8
+    spacing = jet["spacing"](h, signal + 0.2 * random.standard_normal(400), 10.0, 40.0)
+    assert abs(spacing.length - 24.4) < 4 * spacing.sigma
+    assert 0.01 < spacing.sigma < 0.5
+    assert spacing.explained > 0.8
 
 
 @pytest.mark.slow

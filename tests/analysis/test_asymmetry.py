@@ -121,9 +121,9 @@ def test_a_cross_validation_that_is_stopped_shows_its_halves(tmp_path):
 @pytest.mark.slow
 def test_a_flow_that_is_not_axisymmetric_is_not_to_be_used(tmp_path):
     measured("flame", noise=0.03).write(tmp_path / "flame.nc")
-    found = reconstruct(tmp_path / "flame.nc", tmp_path / "r")["verdict"]
-    assert found["rating"] == "do not use"
-    assert "axisymmetric: the halves of 0deg correlate by" in found["reasons"]
+    conclusion = reconstruct(tmp_path / "flame.nc", tmp_path / "r")["verdict"]
+    assert conclusion["rating"] == "do not use"
+    assert "axisymmetric: the halves of 0deg correlate by" in conclusion["reasons"]
 
 
 @pytest.mark.parametrize(

@@ -90,10 +90,10 @@ MISTAKES = {
 @pytest.mark.parametrize("name", MISTAKES)
 def test_mistakes_are_named(clean, name):
     mistake, sentence = MISTAKES[name]
-    found = check_consistency(spoilt(clean, mistake), voxels=20)
-    (finding,) = found.findings
+    check = check_consistency(spoilt(clean, mistake), voxels=20)
+    (finding,) = check.findings
     assert finding.sentence.startswith(sentence)
-    assert len(found.views) == 6
+    assert len(check.views) == 6
 
 
 @pytest.mark.slow
@@ -101,8 +101,8 @@ def test_exchanged_neighbours_of_nine_are_detected():
     ring = Ring(views=9, arc=(0.0, 170.0), image_size=(40, 48), pixel_pitch=0.09)
     correct = simulate(make_phantom("flame", BOX, 0), ring.cameras(), BOX, 1.00027, 0.05, 0, steps=30)
     assert check_consistency(correct).findings == ()
-    found = check_consistency(spoilt(correct, exchanged(3, 4)))
-    assert [(f.code, f.views) for f in found.findings] == [("exchanged", ("63.75deg", "85deg"))]
+    check = check_consistency(spoilt(correct, exchanged(3, 4)))
+    assert [(f.code, f.views) for f in check.findings] == [("exchanged", ("63.75deg", "85deg"))]
 
 
 @pytest.mark.slow
@@ -110,9 +110,9 @@ def test_exchanged_neighbours_of_nine_are_detected():
 def test_a_view_of_another_flow_or_of_noise_is_named(clean, other):
     noise = 0.04 * torch.randn(clean.displacement.shape[1:], generator=torch.Generator().manual_seed(0))
     values = noise if other == "noise" else measure("gaussians", 3).displacement[2]
-    found = check_consistency(spoilt(clean, in_view(2, lambda d: values)), voxels=20)
-    assert "60deg" in [v.name for v in found.views if v.verdict]
-    assert other == "flow" or ("unlike", ("60deg",)) in [(f.code, f.views) for f in found.findings]
+    check = check_consistency(spoilt(clean, in_view(2, lambda d: values)), voxels=20)
+    assert "60deg" in [v.name for v in check.views if v.verdict]
+    assert other == "flow" or ("unlike", ("60deg",)) in [(f.code, f.views) for f in check.findings]
 
 
 @pytest.mark.parametrize(
@@ -123,17 +123,17 @@ def test_a_view_of_another_flow_or_of_noise_is_named(clean, other):
 )  # fmt: skip
 def test_no_false_alarm(phantom, seed, noise, step):
     measurement = measure(phantom, seed, noise=noise)
-    found = check_consistency(measurement.select(measurement.names[::step]), voxels=20 if step == 1 else COARSE)
-    assert found.findings == ()
-    assert all(v.verdict == "" for v in found.views)
-    assert any("lighter" in r for r in found.remarks)
+    check = check_consistency(measurement.select(measurement.names[::step]), voxels=20 if step == 1 else COARSE)
+    assert check.findings == ()
+    assert all(v.verdict == "" for v in check.views)
+    assert any("lighter" in r for r in check.remarks)
 
 
 @pytest.mark.slow
 def test_all_signs_flipped_is_a_denser_flow(clean):
-    found = check_consistency(spoilt(clean, lambda d: -d), voxels=20)
-    assert found.findings == ()
-    assert any("denser" in r for r in found.remarks)
+    check = check_consistency(spoilt(clean, lambda d: -d), voxels=20)
+    assert check.findings == ()
+    assert any("denser" in r for r in check.remarks)
 
 
 # -- open faces ---------------------------------------------------------------------------------------------------
@@ -167,8 +167,8 @@ def test_open_faces_show_in_the_rays_through_them(tall):
 
 @pytest.mark.slow
 def test_open_faces_are_findings(tall):
-    found = check_consistency(tall, voxels=20)
-    assert [f.sentence.split(":")[0] for f in found.findings] == ["face z-", "face z+"]
+    check = check_consistency(tall, voxels=20)
+    assert [f.sentence.split(":")[0] for f in check.findings] == ["face z-", "face z+"]
 
 
 # -- images of a part of the flow ---------------------------------------------------------------------------------
@@ -194,9 +194,9 @@ def test_a_shaken_camera_or_noise_cuts_nothing(small):
 @pytest.mark.parametrize(("phantom", "views"), [("flame", 3), ("fire", 4)])
 def test_views_of_a_part_of_the_flow_accuse_nothing(phantom, views):
     m = square(phantom=phantom, views=views, image_size=(20, 20), pixel_pitch=0.04, noise=0.02)
-    found = check_consistency(m, voxels=COARSE)
-    assert (found.findings, found.corrections) == ((), {})
-    assert found.remarks[0].startswith("the images show only 6% of the box, and the displacement does not fall to zero")
+    check = check_consistency(m, voxels=COARSE)
+    assert (check.findings, check.corrections) == ((), {})
+    assert check.remarks[0].startswith("the images show only 6% of the box, and the displacement does not fall to zero")
 
 
 # -- the maps by themselves ---------------------------------------------------------------------------------------
@@ -207,9 +207,9 @@ def test_two_views_or_views_of_nothing_are_no_error(clean):
         (clean.select(clean.names[:2]), "fewer than three views"),
         (spoilt(clean.select(clean.names[:3]), torch.zeros_like), "every displacement of rays through the box is 0"),
     ):
-        found = check_consistency(measurement, voxels=8)
-        assert found.views == found.findings == ()
-        assert found.remarks[-1].startswith(remark)
+        check = check_consistency(measurement, voxels=8)
+        assert check.views == check.findings == ()
+        assert check.remarks[-1].startswith(remark)
 
 
 @pytest.mark.slow
@@ -217,9 +217,9 @@ def test_camera_shake_and_missing_pixels_are_remarks(clean):
     shaken = spoilt(clean, in_view(2, lambda d: d + torch.tensor([1.5, 0.0])))
     valid = torch.ones(shaken.displacement.shape[:3], dtype=torch.bool)
     valid[0, :20] = False
-    found = check_consistency(replace(shaken, valid=valid), voxels=20)
-    assert any("view 60deg: displacement at the border (1." in r for r in found.remarks)
-    assert any("view 0deg: only 33% of its pixels" in r for r in found.remarks)
+    check = check_consistency(replace(shaken, valid=valid), voxels=20)
+    assert any("view 60deg: displacement at the border (1." in r for r in check.remarks)
+    assert any("view 0deg: only 33% of its pixels" in r for r in check.remarks)
 
 
 def test_bins_need_not_be_square():
@@ -365,8 +365,8 @@ def test_the_transform_of_an_image_fits_best(small, code):
 @pytest.mark.parametrize("code", ["upside_down", "mirrored", "transposed", "quarter_turn"])
 def test_the_transform_of_an_image_is_named(code):
     measurement = square(views=6, image_size=(30, 30), pixel_pitch=0.15)
-    (found,) = check_consistency(spoilt(measurement, in_view(3, TRANSFORMS[code])), voxels=16).findings
-    assert (found.code, found.views) == (code, (measurement.names[3],))
+    (check,) = check_consistency(spoilt(measurement, in_view(3, TRANSFORMS[code])), voxels=16).findings
+    assert (check.code, check.views) == (code, (measurement.names[3],))
 
 
 def test_transforms_of_square_images_only(small):
@@ -436,10 +436,10 @@ def test_noise_is_not_repeatable(small):
 
 @pytest.mark.slow
 def test_unrelated_views_are_the_first_finding(small):
-    found = check_consistency(in_metres(small), voxels=COARSE)
-    assert [finding.code for finding in found.findings] == ["unrelated", "inside"]
-    assert all(view.verdict == "not predicted by the others" for view in found.views)
-    assert not found.corrections
+    check = check_consistency(in_metres(small), voxels=COARSE)
+    assert [finding.code for finding in check.findings] == ["unrelated", "inside"]
+    assert all(view.verdict == "not predicted by the others" for view in check.views)
+    assert not check.corrections
 
 
 @pytest.mark.slow
@@ -455,9 +455,9 @@ def test_images_sorted_by_letters_are_named():
     correct = square(cameras)
     assert check_consistency(correct, voxels=COARSE).findings == ()
     order = [2, 3, 4, 0, 1]  # 10, 11, 12, 8, 9
-    (found,) = check_consistency(spoilt(correct, lambda d: d[order]), voxels=COARSE).findings
-    assert found.code in ("reordered", "unrelated")
-    assert "in alphabetical order (10 before 2)" in found.sentence
+    (check,) = check_consistency(spoilt(correct, lambda d: d[order]), voxels=COARSE).findings
+    assert check.code in ("reordered", "unrelated")
+    assert "in alphabetical order (10 before 2)" in check.sentence
 
 
 @pytest.mark.slow

@@ -141,11 +141,11 @@ def test_the_end_of_a_film_is_near(synchronous):
 @pytest.mark.slow
 def test_two_views_show_a_difference_but_not_which_is_late(synchronous):
     frames = [frame.select(frame.names[:2]) for frame in late(synchronous, {1: 2})]
-    found = check_film(Frames(frames), 12)
-    (finding,) = found.findings
+    check = check_film(Frames(frames), 12)
+    (finding,) = check.findings
     assert (finding.code, finding.views) == ("late", ("45deg",))
     assert "2 frames late, or the other views 2 frames early; equal numbers of views do not decide" in str(finding)
-    assert found.remarks[-1].startswith("fewer than three views: from one instant the check cannot tell")
+    assert check.remarks[-1].startswith("fewer than three views: from one instant the check cannot tell")
 
 
 def test_the_remedy_adds_to_the_offsets_of_the_measurement():

@@ -81,7 +81,7 @@ def test_few_pixels_and_exact_fits_are_not_tested():
      pytest.param("window6", "blur", 8, marks=pytest.mark.slow), pytest.param("f4", "blur", 7, marks=pytest.mark.slow)],
 )  # fmt: skip
 def test_measurements_of_another_program(file, cause, views):
-    """Against the prediction of the true field for the stated rig by thin rays: at least so many views of the cause."""
+    """Against the prediction of the true field for the stated rig by thin rays: at least n views with the cause."""
     measured, thin = Measurement.read(RIGS / f"{file}.nc"), Measurement.read(RIGS / "thin.nc")
     truth = read_volume(RIGS / "truth.nc")
     field = VoxelField.through(truth.values.double(), truth.grid)

@@ -39,13 +39,13 @@ def test_fine_triangles_cover_the_surface_and_have_short_edges():
 
 
 def test_the_surface_has_the_index_of_the_field_and_its_density(surface):
-    known = surface.quantities["index_excess"].isfinite()
-    expected = make_phantom("gaussians", BOX, 0).value(surface.vertices[known].float())
-    torch.testing.assert_close(surface.quantities["index_excess"][known], expected)
+    finite = surface.quantities["index_excess"].isfinite()
+    expected = make_phantom("gaussians", BOX, 0).value(surface.vertices[finite].float())
+    torch.testing.assert_close(surface.quantities["index_excess"][finite], expected)
     k = gladstone_dale("air", 532.0)
-    torch.testing.assert_close(surface.quantities["density"][known], ((N_AMBIENT - 1) + expected) / k)
+    torch.testing.assert_close(surface.quantities["density"][finite], ((N_AMBIENT - 1) + expected) / k)
     beyond = surface.vertices[:, 0] > 20.0
-    assert torch.equal(~known, beyond)
+    assert torch.equal(~finite, beyond)
     assert 0.0 < float(beyond.double().mean()) < 0.2  # of triangles that reach into the box
     assert not bool(beyond[surface.faces].all(dim=1).any())
 

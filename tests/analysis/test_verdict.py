@@ -83,16 +83,16 @@ BLURRED = [view(name, 0.06, **CORRELATED, cause="blur") for name in "abcd"]
     ],
 )
 def test_words(metrics, word):
-    found = judged(**metrics)
-    assert found.rating == word
+    values = judged(**metrics)
+    assert values.rating == word
     assert word in RATINGS
-    assert found.sentence.lower().startswith(word)
+    assert values.sentence.lower().startswith(word)
 
 
 def test_a_first_run_that_was_too_short_gives_no_estimate():
-    found = judged(views=views_of(0.02), cross_validation=first_run(0.98, 0.97))
-    assert (found.rating, found.error) == ("cannot tell", None)
-    assert "too short" in found.reasons
+    values = judged(views=views_of(0.02), cross_validation=first_run(0.98, 0.97))
+    assert (values.rating, values.error) == ("cannot tell", None)
+    assert "too short" in values.reasons
     assert judged(views=views_of(0.6), cross_validation=first_run(0.6, 0.6)).rating != "cannot tell"
 
 
@@ -175,10 +175,10 @@ def test_a_field_that_is_smooth_by_its_method_is_named_before_the_measurement(ca
 def test_detail_not_yet_learned_is_no_wrong_pose_of_a_refined_rig():
     metrics = {"views": UNLEARNED, "cross_validation": first_run(0.05), "outcome": "time_limit"}
     assert judged(**metrics).rating == "do not use"
-    found = judged(REFINED, **metrics)
-    assert (found.rating, found.error) == ("use with care", pytest.approx(0.03, rel=0.3))
-    assert "f: 2.5% of the signal" in found.reasons
-    assert "wrong camera pose" not in found.reasons
+    values = judged(REFINED, **metrics)
+    assert (values.rating, values.error) == ("use with care", pytest.approx(0.03, rel=0.3))
+    assert "f: 2.5% of the signal" in values.reasons
+    assert "wrong camera pose" not in values.reasons
     far = [{**v, "rms": 0.4, "rms_white": 0.02} if v["name"] == "f" else v for v in UNLEARNED]
     assert judged(REFINED, **{**metrics, "views": far}).rating == "do not use"  # more than the estimate accounts for
 
@@ -200,12 +200,12 @@ def test_advice_where_nothing_gives_an_estimate(settings, names, advised):
 )  # fmt: skip
 def test_a_fit_that_the_time_limit_cut_short(seconds, outcome, trials, word):
     uncertainty = {"kind": "full", "source": "bootstrap", "trials": trials, "diverged_trials": [], "seconds": 1.0}
-    found = judged(
+    values = judged(
         {"time_limit": 60.0}, views=VIEWS, cross_validation=FIRST, outcome=outcome, seconds=seconds,
         uncertainty=uncertainty if trials else None,
     )  # fmt: skip
-    assert found.rating == word
-    assert ("of the time limit of 60 s" in found.reasons) == (outcome == "time_limit")
+    assert values.rating == word
+    assert ("of the time limit of 60 s" in values.reasons) == (outcome == "time_limit")
 
 
 @pytest.mark.parametrize(("share", "word"), [(0.64, "cannot tell"), (0.3, "use")])  # CC 0.77 and 0.95
@@ -259,30 +259,30 @@ ASYMMETRY = {"name": "a", "antisymmetry": 0.5, "cc": {"u": 0.4, "v": 0.6}}
 def test_one_camera_is_checked_by_no_other(names):
     measured = ["displacement", "absorption"]
     views = [{**noisy(n, 0.02), "measured": m} for n, m in zip(names, measured, strict=False)]
-    found = judged(views=views, cross_validation=first_run(0.1), axis={"symmetry": AXIS})
-    assert found.rating == "use with care"
-    assert ONE_CAMERA in found.reasons
+    values = judged(views=views, cross_validation=first_run(0.1), axis={"symmetry": AXIS})
+    assert values.rating == "use with care"
+    assert ONE_CAMERA in values.reasons
 
 
 @pytest.mark.parametrize(("symmetry", "word"), [(AXIS, "do not use"), ({**AXIS, "harmonics": 2}, "use")])
 def test_halves_may_differ_where_the_flow_may(symmetry, word):
-    found = judged(views=VIEWS, cross_validation=FIRST, axis={"symmetry": symmetry}, asymmetry=[ASYMMETRY])
-    assert found.rating == word
+    values = judged(views=VIEWS, cross_validation=FIRST, axis={"symmetry": symmetry}, asymmetry=[ASYMMETRY])
+    assert values.rating == word
 
 
 def test_a_flow_along_another_axis_is_of_no_use():
     axis = {"symmetry": AXIS, "better_direction": [1.0, 0.0, 0.0]}
-    found = judged(views=views_of(0.02), cross_validation=first_run(0.1), axis=axis)
-    assert found.rating == "do not use"
-    assert "--axis-direction 1 0 0" in found.reasons
+    values = judged(views=views_of(0.02), cross_validation=first_run(0.1), axis=axis)
+    assert values.rating == "do not use"
+    assert "--axis-direction 1 0 0" in values.reasons
 
 
 def test_asymmetry_does_not_excuse_a_contradicting_view():
     views, roughly = [*VIEWS[1:], view("a", 0.06, **CORRELATED)], [{**ASYMMETRY, "antisymmetry": 0.3}]
-    found = judged(views=views, cross_validation=FIRST, axis={"symmetry": AXIS}, asymmetry=roughly)
-    assert found.rating == "do not use"
-    assert "only roughly axisymmetric" in found.reasons
-    assert "spatially correlated" in found.reasons
+    values = judged(views=views, cross_validation=FIRST, axis={"symmetry": AXIS}, asymmetry=roughly)
+    assert values.rating == "do not use"
+    assert "only roughly axisymmetric" in values.reasons
+    assert "spatially correlated" in values.reasons
 
 
 @pytest.mark.parametrize(
@@ -292,14 +292,14 @@ def test_asymmetry_does_not_excuse_a_contradicting_view():
 )  # fmt: skip
 def test_cameras_are_counted_once_for_all_techniques(symmetry, phrase):
     images = [{**v, "measured": "flow"} for v in VIEWS[:2]]
-    found = judged(views=[*VIEWS[:2], *images], cross_validation=FIRST, axis=symmetry and {"symmetry": symmetry})
-    assert phrase in found.reasons
+    values = judged(views=[*VIEWS[:2], *images], cross_validation=FIRST, axis=symmetry and {"symmetry": symmetry})
+    assert phrase in values.reasons
 
 
 def test_truth_and_stated_sigma_do_not_matter():
-    found = judged(views=VIEWS, cross_validation=FIRST)
-    assert judged(views=VIEWS, cross_validation=FIRST, cc=0.1, l2_variation=3.0) == found
-    assert judged(views=[{**v, "rms_over_sigma": 40.0} for v in VIEWS], cross_validation=FIRST) == found
+    values = judged(views=VIEWS, cross_validation=FIRST)
+    assert judged(views=VIEWS, cross_validation=FIRST, cc=0.1, l2_variation=3.0) == values
+    assert judged(views=[{**v, "rms_over_sigma": 40.0} for v in VIEWS], cross_validation=FIRST) == values
 
 
 def test_standard_deviations_give_an_estimate():
@@ -311,9 +311,9 @@ def test_standard_deviations_give_an_estimate():
     def with_deviations(views):
         return verdict(Result(Path(), metrics=Metrics(views=views), volumes=volumes))
 
-    found = with_deviations(VIEWS)
-    assert (found.rating, found.error) == ("use", pytest.approx(0.02))
-    assert "standard deviations" in found.sentence
+    values = with_deviations(VIEWS)
+    assert (values.rating, values.error) == ("use", pytest.approx(0.02))
+    assert "standard deviations" in values.sentence
     assert with_deviations(VIEWS[:3]).rating == "use with care"  # no deviation shows what three views leave open
     assert with_deviations([*VIEWS, view("g", 0.3, True)]).error > 0.07
 
@@ -336,9 +336,9 @@ def test_two_estimates_are_averaged_where_they_agree():
     ],
 )
 def test_the_error_is_stated_with_what_it_is_of_and_estimated_from(metrics, sentence):
-    found = judged(**metrics).sentence
-    assert re.match(r"Use: the field is wrong by about [\d.]+ % of its difference from the ambient \(rms, ", found)
-    assert sentence in found
+    values = judged(**metrics).sentence
+    assert re.match(r"Use: the field is wrong by about [\d.]+ % of its difference from the ambient \(rms, ", values)
+    assert sentence in values
 
 
 def test_the_headline_of_the_report():

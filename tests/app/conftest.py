@@ -14,7 +14,7 @@ from report.browsing import open_browser
 
 @pytest.fixture(scope="session", autouse=True)
 def state_of_nobody(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """A state directory of the tests: nothing is written into that of whoever runs them."""
+    """A state directory of the tests: nothing is written into the user's."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
         yield
@@ -42,5 +42,5 @@ def browser(chromium: Any) -> Iterator[Any]:
 @pytest.fixture(scope="module")
 def server(folder: Path) -> Iterator[Served]:
     """The app on the folder of a test's file."""
-    with served(folder) as found:
-        yield found
+    with served(folder) as process:
+        yield process

@@ -1,4 +1,4 @@
-"""A process that has imported the app, and forks a server for whoever asks: the second one starts at once.
+"""A process that has imported the app, and forks servers on request: the second one starts at once.
 
 Lines on standard input ask: {"words": arguments of nerif, "out": a named pipe for what it prints, "by": command
 that starts it instead, if it holds any words}. The answer is the number of its process.

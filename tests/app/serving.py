@@ -41,7 +41,7 @@ class Served:
     link: str
     port: int
     pid: int
-    said: str
+    output: str
 
     @property
     def token(self) -> str:
@@ -69,9 +69,9 @@ def free_port() -> int:
 
 
 def outside() -> dict[str, str]:
-    """The environment without what tells of a test: NiceGUI behaves otherwise where it is told of one."""
-    known = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST")}
-    return {**known, "PYTHONUNBUFFERED": "1", "OMP_NUM_THREADS": "1"}
+    """The environment without pytest's variables, with which NiceGUI behaves otherwise."""
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST")}
+    return {**environment, "PYTHONUNBUFFERED": "1", "OMP_NUM_THREADS": "1"}
 
 
 @cache
@@ -113,12 +113,12 @@ def served(folder: Path, *arguments: str, port: int | None = None, by: Sequence[
 
 def answering(pid: int, printed: Iterable[str]) -> Served:
     """Wait until a server says that it answers."""
-    said = ""
+    output = ""
     for line in printed:
-        said += line
-        if found := re.search(r"http://[^:]+:(\d+)/\?token=\S+", line):
-            return Served(found[0], int(found[1]), pid, said)
-    raise AssertionError(f"it did not start: {said}")
+        output += line
+        if match := re.search(r"http://[^:]+:(\d+)/\?token=\S+", line):
+            return Served(match[0], int(match[1]), pid, output)
+    raise AssertionError(f"it did not start: {output}")
 
 
 def end(pid: int, printed: IO[str]) -> None:

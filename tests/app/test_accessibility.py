@@ -72,21 +72,21 @@ def settled(driver: Any) -> None:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    found = tmp_path_factory.mktemp("project")
+    project = tmp_path_factory.mktemp("project")
     ring = Ring(views=3, arc=(20.0, 100.0), image_size=(24, 30), pixel_pitch=0.2)
     board = (40 + 170 * TARGET.raster(3.0)).astype(np.uint8)
     for camera in ring.cameras():
         for source in ("target", "background", "reference", "flow"):
-            (found / "run" / camera.name / source).mkdir(parents=True)
-            iio.imwrite(found / "run" / camera.name / source / "p.png", board)
-    write_cameras(found / "calibration.toml", [CalibratedCamera.from_camera(camera) for camera in ring.cameras()])
-    Simulation(phantom="gaussians", truth_voxels=6)(ring.cameras())[0].write(found / "m.nc")
-    result(found / "results" / "a", 12, 0.0)
-    watched(found)
-    return found
+            (project / "run" / camera.name / source).mkdir(parents=True)
+            iio.imwrite(project / "run" / camera.name / source / "p.png", board)
+    write_cameras(project / "calibration.toml", [CalibratedCamera.from_camera(camera) for camera in ring.cameras()])
+    Simulation(phantom="gaussians", truth_voxels=6)(ring.cameras())[0].write(project / "m.nc")
+    result(project / "results" / "a", 12, 0.0)
+    watched(project)
+    return project
 
 
-def seen(driver: Any, server: Served, page: Page, size: tuple[int, int], dark: bool) -> list[Any]:
+def violations(driver: Any, server: Served, page: Page, size: tuple[int, int], dark: bool) -> list[Any]:
     """Open a page once all of it is there, and return the rules that it breaks."""
     scheme = [{"name": "prefers-color-scheme", "value": "dark" if dark else "light"}]
     driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": scheme})
@@ -112,7 +112,7 @@ CASES = [
 @pytest.mark.parametrize(("size", "dark"), CASES)
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_a_page_breaks_no_rule_fits_and_asks_nobody_else(browser, server, page, size, dark):
-    assert seen(browser, server, page, size, dark) == []
+    assert violations(browser, server, page, size, dark) == []
     wide = browser.execute_script("return document.documentElement.scrollWidth - document.documentElement.clientWidth")
     assert wide <= 0
     assert browser.execute_script(CUT) == []

@@ -27,19 +27,19 @@ NAMES = ("cam1", "cam2", "cam3")
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three views with images of an upright target, one without; a calibration from the command line's library."""
-    found = tmp_path_factory.mktemp("project")
+    project = tmp_path_factory.mktemp("project")
     board = (40 + 170 * TARGET.raster(TARGET.pitch / 8)).astype(np.uint8)
     for name in NAMES:
         for source, count in (("target", 3), ("background", 1), ("reference", 1)):
-            (found / "run" / name / source).mkdir(parents=True)
+            (project / "run" / name / source).mkdir(parents=True)
             for i in range(count):
                 image = np.full((64, 96), 210, np.uint8)
                 if (source, i) != ("target", 2):
                     image[4 : 4 + board.shape[0], 6 + i : 6 + i + board.shape[1]] = board
-                iio.imwrite(found / "run" / name / source / f"p{i}.png", image)
+                iio.imwrite(project / "run" / name / source / f"p{i}.png", image)
     cameras = Ring(views=3, arc=(20.0, 100.0), image_size=(64, 96), pixel_pitch=0.17).cameras()
-    calibrate(target_images(cameras, TARGET, noise=0.01, poses=8)).write(found / "made.toml")
-    return found
+    calibrate(target_images(cameras, TARGET, noise=0.01, poses=8)).write(project / "made.toml")
+    return project
 
 
 def visit(driver: Any, server: Served) -> None:
@@ -75,9 +75,9 @@ def test_corners_are_found_and_a_image_is_left_out_by_a_click(browser, server):
     put(browser, "target.rows", "5")
     points = TARGET.shape[0] * TARGET.shape[1]
     wait_for(browser, f"return document.querySelectorAll('.target circle').length === {3 * points}")
-    said = browser.execute_script("return [...document.querySelectorAll('.target img')].map(e => e.alt)")
-    assert said[0] == f"cam1/target/0, {points} points found"
-    assert said[2] == "cam1/target/2, no target found"
+    texts = browser.execute_script("return [...document.querySelectorAll('.target img')].map(e => e.alt)")
+    assert texts[0] == f"cam1/target/0, {points} points found"
+    assert texts[2] == "cam1/target/2, no target found"
     browser.find_element("css selector", "button[aria-label='Exclude: cam1/target/1']").click()
     wait_for(browser, "return document.querySelector('.command code').textContent.includes('--leave-out')")
     words = line(browser)

@@ -34,14 +34,14 @@ LINE = "document.querySelector('.command code') !== null"
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A measurement by six views, one of which is mirrored."""
-    found = tmp_path_factory.mktemp("project")
+    directory = tmp_path_factory.mktemp("project")
     ring = Ring(views=6, arc=(0.0, 150.0), image_size=(30, 36), pixel_pitch=0.12)
     good = simulate(make_phantom("gaussians", BOX, 1), ring.cameras(), BOX, 1.00027, 0.05, 1, steps=30)
-    good.write(found / "good.nc")
+    good.write(directory / "good.nc")
     d = good.displacements.clone()
     d[3] = d[3].flip(1) * torch.tensor([-1.0, 1.0])
-    replace(good, displacement=d).write(found / "bad.nc")
-    return found
+    replace(good, displacement=d).write(directory / "bad.nc")
+    return directory
 
 
 def click(driver: Any, label: str) -> None:
@@ -109,8 +109,8 @@ def test_a_mirrored_view_is_found_and_undone(browser, server, folder):
     wait_for(browser, "return document.querySelector('.tabled table') !== null")
     assert "the image is mirrored left to right" in text(browser, ".tabled table")
     click(browser, "Correct the mistakes")
-    found, good = written(folder / "bad.corrected.nc", 120), Measurement.read(folder / "good.nc")
-    torch.testing.assert_close(found.displacement, good.displacement)
+    directory, good = written(folder / "bad.corrected.nc", 120), Measurement.read(folder / "good.nc")
+    torch.testing.assert_close(directory.displacement, good.displacement)
     click(browser, "Go on with bad.corrected.nc")
     wait_for(browser, f"return {COMPARISON}.includes('bad.corrected.nc')")
     assert errors(browser) == []
@@ -118,9 +118,9 @@ def test_a_mirrored_view_is_found_and_undone(browser, server, folder):
 
 @pytest.mark.slow
 def test_a_mask_is_drawn_taken_back_and_put_in(browser, server, folder):
-    own = folder / "masks" / "good" / "0deg.png"  # drawn elsewhere, with another program
-    own.parent.mkdir(parents=True)
-    own.write_bytes(b"of the user")
+    drawing = folder / "masks" / "good" / "0deg.png"  # drawn elsewhere, with another program
+    drawing.parent.mkdir(parents=True)
+    drawing.write_bytes(b"of the user")
     opened(browser, server, "displacement", LINE)
     wait_for(browser, "return document.querySelector('.cropper img') !== null")
     for column, row in ((6, 4), (30, 4), (30, 25), (6, 25)):
@@ -143,7 +143,7 @@ def test_a_mask_is_drawn_taken_back_and_put_in(browser, server, folder):
     mask = written(folder / out).flow_mask
     assert bool(mask[0, 4:25, 6:30].all())
     assert not bool(mask[0, :3].any())
-    assert own.read_bytes() == b"of the user"
+    assert drawing.read_bytes() == b"of the user"
     click(browser, f"Go on with {out}")
     wait_for(browser, f"return document.querySelector('input[aria-label=Measurement]').value === {out!r}")
     assert errors(browser) == []

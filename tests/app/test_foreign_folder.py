@@ -56,7 +56,7 @@ def ended(jobs: Jobs, id: str) -> str:
 def test_the_app_runs_nothing_of_a_folder_and_its_users_run_nonetheless(tmp_path):
     plant(tmp_path)
     jobs = Jobs(tmp_path)
-    own = jobs.add(("info", "m.nc"), "own").id
+    own_job = jobs.add(("info", "m.nc"), "own").id
     words = [sys.executable, "-P", "-m", "nerif", "app", ".", "--no-browser", "--port", str(free_port())]
     with subprocess.Popen(
         words, cwd=tmp_path, env=outside(), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
@@ -64,10 +64,10 @@ def test_the_app_runs_nothing_of_a_folder_and_its_users_run_nonetheless(tmp_path
         assert server.stdout is not None
         try:
             answering(server.pid, server.stdout)
-            assert ended(jobs, own) == "failed"  # there is no m.nc
+            assert ended(jobs, own_job) == "failed"  # there is no m.nc
         finally:
             end(server.pid, server.stdout)
-    assert "m.nc" in jobs.log(own)[-1]
+    assert "m.nc" in jobs.log(own_job)[-1]
     assert jobs.get("planted").state == "held"
     assert not (jobs.directory / "planted" / "log.txt").exists()
     assert not (tmp_path / "mark").exists()

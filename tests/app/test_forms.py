@@ -42,7 +42,7 @@ def test_every_field_of_every_method_has_its_text(method):
 
 
 @pytest.mark.parametrize(
-    ("values", "name", "said"),
+    ("values", "name", "message"),
     [
         ({"f_number": -1.0}, "f_number", "Expected a positive number, got -1.0"),
         ({"views": "many"}, "views", "Expected a whole number, got 'many'"),
@@ -51,10 +51,10 @@ def test_every_field_of_every_method_has_its_text(method):
         ({"temperature": 293.15}, "temperature", "not ambient_temperature"),
     ],
 )
-def test_what_is_wrong_stands_beside_its_field(values, name, said):
+def test_what_is_wrong_stands_beside_its_field(values, name, message):
     errors = FORM.errors(values)
     assert list(errors) == [name]
-    assert said in errors[name]
+    assert message in errors[name]
     with pytest.raises(InputError):
         FORM.build(values)
 
@@ -94,8 +94,8 @@ def test_the_command_line_of_nested_fields_and_switches_gives_the_same_record():
     form = form_of("nerif", "fast")
     values = {"report": False, "network.gradient_head": True, "weights.head": 0.5, "withhold": ["0deg", "20deg"]}
     made = form.build(values)
-    given = dataclasses.replace(form.record, measurement=MISSING, out=MISSING)
-    parsed = read_settings(given, ["m.nc", "-o", "x", *form.arguments(values)], "reconstruct")
+    empty = dataclasses.replace(form.record, measurement=MISSING, out=MISSING)
+    parsed = read_settings(empty, ["m.nc", "-o", "x", *form.arguments(values)], "reconstruct")
     assert parsed.run == made.run
     assert parsed.reconstructor == made.reconstructor
 
@@ -109,11 +109,11 @@ def test_the_command_line_of_nested_fields_and_switches_gives_the_same_record():
     ],
 )
 def test_what_a_run_would_say_at_its_start_is_said_before(measurement, tmp_path, values, lines):
-    path, found = tmp_path / "m.nc", list[str]()
+    path, calls = tmp_path / "m.nc", list[str]()
     measurement.select(measurement.names[:4]).write(path)
-    prepare(path, tmp_path / "r", form_of("nerif", "fast").build({"voxels": 8, **values}), found.append)
-    assert len(found) == len(lines)
-    assert all(line in text for line, text in zip(lines, found, strict=True))
+    prepare(path, tmp_path / "r", form_of("nerif", "fast").build({"voxels": 8, **values}), calls.append)
+    assert len(calls) == len(lines)
+    assert all(line in text for line, text in zip(lines, calls, strict=True))
     assert [p.name for p in tmp_path.iterdir()] == ["m.nc"]
 
 

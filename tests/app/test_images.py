@@ -24,19 +24,19 @@ NAMES = ("cam1", "cam <2>", "cam3")
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three views: one in order, one with a broken image, one without flow."""
-    found = tmp_path_factory.mktemp("project")
+    directory = tmp_path_factory.mktemp("project")
     rng = np.random.default_rng(3)
     for name in NAMES:
         for source in ("reference", "flow"):
             if (name, source) == ("cam3", "flow"):
                 continue
-            where = found / "run" / name / source
+            where = directory / "run" / name / source
             where.mkdir(parents=True)
             scene = rng.integers(20, 220, (HEIGHT, WIDTH), dtype=np.uint8)
             for i in range(2):
                 iio.imwrite(where / f"p{i}.png", scene)
-    (found / "run" / "cam <2>" / "reference" / "p1.png").write_bytes(b"broken")
-    return found
+    (directory / "run" / "cam <2>" / "reference" / "p1.png").write_bytes(b"broken")
+    return directory
 
 
 def test_steps_are_undone_and_kept():

@@ -1,4 +1,4 @@
-"""What befalls a lab: two tabs, a reload and a killed server in the middle of training, a folder of somebody else."""
+"""What befalls a lab: two tabs, a reload and a killed server in the middle of training, a folder of another user."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ GOES_ON = "return /It runs.*step [1-9]/.test(document.querySelector('.status')?.
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    found = tmp_path_factory.mktemp("project")
-    assert main(["simulate", "-o", str(found / "m.nc"), *SMALL, "--truth-voxels", "8"]) == 0
-    return found
+    directory = tmp_path_factory.mktemp("project")
+    assert main(["simulate", "-o", str(directory / "m.nc"), *SMALL, "--truth-voxels", "8"]) == 0
+    return directory
 
 
 def press(driver: Any, label: str) -> None:
@@ -97,7 +97,7 @@ def closed(tmp_path: Path) -> Iterator[Path]:
     tmp_path.chmod(0o755)
 
 
-def said(driver: Any, server: Served, page: str) -> str:
+def notice(driver: Any, server: Served, page: str) -> str:
     """What a page of the folder says of it."""
     driver.get(f"http://127.0.0.1:{server.port}/{page}?token={server.token}")
     wait_for(driver, "return document.querySelector('main [role=status]') !== null && window.socket?.connected")
@@ -105,15 +105,15 @@ def said(driver: Any, server: Served, page: str) -> str:
 
 
 @pytest.mark.slow
-def test_a_folder_without_rights_is_told_in_one_line_and_can_be_read(browser, closed):
+def test_a_folder_without_rights_is_one_line_and_can_be_read(browser, closed):
     root = os.geteuid() == 0
     if root and shutil.which("setpriv") is None:
         pytest.skip("root may write everywhere, and setpriv, by which it may not, is not there")
     with served(closed, by=BOUND if root else ()) as server:
-        assert f"note: {READ_ONLY}" in server.said
+        assert f"note: {READ_ONLY}" in server.output
         browser.get_log("browser")
         for page in PAGES:
-            assert said(browser, server, page.name) == READ_ONLY
+            assert notice(browser, server, page.name) == READ_ONLY
         visit(browser, server, "reconstruct")
         assert line(browser)[:3] == ["nerif", "reconstruct", "m.nc"]
         browser.find_element("xpath", "//button[contains(., 'Start')]").click()

@@ -79,12 +79,12 @@ def sleeping(jobs: Jobs, process: subprocess.Popen[bytes], **more: object) -> st
 @pytest.fixture
 def process():
     code = "import signal, time; signal.signal(2, signal.default_int_handler); print('up', flush=True); time.sleep(60)"
-    found = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
-    assert found.stdout is not None
-    found.stdout.readline()
-    yield found
-    found.kill()
-    found.communicate()
+    child = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
+    assert child.stdout is not None
+    child.stdout.readline()
+    yield child
+    child.kill()
+    child.communicate()
 
 
 def test_another_server_finds_what_runs_and_may_end_it(tmp_path, process):
@@ -138,7 +138,7 @@ def test_what_is_paused_goes_on_from_its_checkpoint(tmp_path, process):
         jobs.pause(other.id)
 
 
-def test_what_is_asked_while_a_run_starts_is_heard(tmp_path):
+def test_a_stop_while_a_run_starts_is_obeyed(tmp_path):
     jobs = Jobs(tmp_path)
     job = jobs.add(["demo", "--out", "demo"], "a demo", "demo")
     where = jobs.directory / job.id

@@ -53,9 +53,9 @@ def watched(folder: Path) -> None:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    found = tmp_path_factory.mktemp("project")
-    watched(found)
-    return found
+    place = tmp_path_factory.mktemp("project")
+    watched(place)
+    return place
 
 
 def test_a_slow_run_is_shown_to_be_one():
@@ -65,12 +65,12 @@ def test_a_slow_run_is_shown_to_be_one():
     assert "note" not in status_html(job, {**live, "remark": ""})
 
 
-def test_a_surface_is_told_in_words(folder, tmp_path):
-    found = read_snapshot(folder / OUT)
-    assert found is not None
-    assert found.volume.grid.box.upper == UPPER
-    said = caption_of(found)
-    assert said.startswith("Isosurface of refractive index at -5e-05, x from -6 to 6, y from -6 to 6, z from -6 to 6")
+def test_a_surface_has_a_caption(folder, tmp_path):
+    place = read_snapshot(folder / OUT)
+    assert place is not None
+    assert place.volume.grid.box.upper == UPPER
+    title = caption_of(place)
+    assert title.startswith("Isosurface of refractive index at -5e-05, x from -6 to 6, y from -6 to 6, z from -6 to 6")
     look(tmp_path, -50.0, 3.0)
     nothing = read_snapshot(tmp_path)
     assert nothing is not None
@@ -81,8 +81,8 @@ def test_the_surface_comes_from_the_folder_alone(server):
     cookie = {"Cookie": server.cookie()}
     assert server.get("/live-surface?of=results/a%20%3Cb%3E&stamp=1", cookie)[0] == 200
     assert server.get("/live-surface?of=results/a%20%3Cb%3E&stamp=1")[0] == 403
-    for asked in ("../x", "results", "%00", "/etc"):
-        assert server.get(f"/live-surface?of={asked}", cookie)[0] == 404
+    for name in ("../x", "results", "%00", "/etc"):
+        assert server.get(f"/live-surface?of={name}", cookie)[0] == 404
 
 
 @needs_browser
@@ -94,8 +94,8 @@ def test_images_and_surface_follow_the_run(browser, server, folder):
     assert "x from -6 to 6" in browser.execute_script(f"return {alt}")
     look(folder / OUT, 8.0, 2.0)
     wait_for(browser, f"return {alt}.includes('x from -8 to 8')")
-    asked = "performance.getEntriesByType('resource').filter(e => /live-surface/.test(e.name))"
-    wait_for(browser, f"return {asked}.length === 2")
+    name = "performance.getEntriesByType('resource').filter(e => /live-surface/.test(e.name))"
+    wait_for(browser, f"return {name}.length === 2")
     surfaces = [address for address in requests(browser) if "/live-surface?" in address]
     assert len(set(surfaces)) == 2
     assert errors(browser) == []

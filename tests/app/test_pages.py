@@ -21,10 +21,10 @@ pytestmark = needs_browser
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    found = tmp_path_factory.mktemp("project")
+    project = tmp_path_factory.mktemp("project")
     small = ["--image-size", "20", "24", "--pixel-pitch", "0.18", "--views", "4", "--arc", "0", "135"]
-    assert main(["simulate", "-o", str(found / "m & <b>.nc"), *small, "--truth-voxels", "8"]) == 0
-    return found
+    assert main(["simulate", "-o", str(project / "m & <b>.nc"), *small, "--truth-voxels", "8"]) == 0
+    return project
 
 
 LINE = "document.querySelector('.command code') !== null"
@@ -103,10 +103,10 @@ def test_every_control_has_a_name_and_the_page_its_landmarks(browser, server):
 def test_too_short_a_time_limit_is_said_before_the_start(browser, server):
     visit(browser, server, "reconstruct")
     put(browser, "time_limit", "1")
-    said = "[...document.querySelectorAll('[role=status] .note')].map(e => e.textContent).join()"
-    wait_for(browser, f"return {said}.includes('--time-limit 1 is too short')", 60)
+    notes = "[...document.querySelectorAll('[role=status] .note')].map(e => e.textContent).join()"
+    wait_for(browser, f"return {notes}.includes('--time-limit 1 is too short')", 60)
     put(browser, "time_limit", "0")
-    wait_for(browser, f"return {said} === ''", 60)
+    wait_for(browser, f"return {notes} === ''", 60)
 
 
 @pytest.mark.slow
@@ -118,9 +118,9 @@ def test_a_run_is_started_watched_and_stopped(browser, server, folder):
     browser.find_element("xpath", "//button[contains(., 'Start')]").click()
     wait_for(browser, "return document.querySelectorAll('.images img').length >= 7", 120)
     wait_for(browser, "return document.querySelector('.curve canvas') !== null")
-    said = browser.execute_script("return [...document.querySelectorAll('.images img')].map(e => e.alt)")
-    assert "measured" in said[0]
-    assert "predicted" in said[1]
+    notes = browser.execute_script("return [...document.querySelectorAll('.images img')].map(e => e.alt)")
+    assert "measured" in notes[0]
+    assert "predicted" in notes[1]
     out = folder / "results" / "m & <b>-nerif"
     look, live = read_snapshot(out), read_live(out)
     assert look is not None

@@ -1,4 +1,4 @@
-"""What is found in a folder, and that nothing outside of it is touched."""
+"""The contents of a folder, and that nothing outside of it is touched."""
 
 from __future__ import annotations
 
@@ -72,13 +72,13 @@ def test_what_is_in_a_folder(folder):
     (folder / "away").symlink_to(folder.parent)
     (folder / "away.nc").symlink_to(folder.parent / "secret")
     project = ProjectFolder(folder)
-    found = project.contents()
-    assert found.measurements == ("<b>&.nc", "broken.nc")
-    assert found.volumes == ("<b>&.truth.nc",)
-    assert found.calibrations == ("cal.toml",)
-    assert found.results == ("runs/one",)
-    assert found.films == ("film.zarr",)
-    assert found.experiments == ("images",)
+    files = project.contents()
+    assert files.measurements == ("<b>&.nc", "broken.nc")
+    assert files.volumes == ("<b>&.truth.nc",)
+    assert files.calibrations == ("cal.toml",)
+    assert files.results == ("runs/one",)
+    assert files.films == ("film.zarr",)
+    assert files.experiments == ("images",)
     assert [view.name for view in project.views("images")] == ["cam1"]
 
 

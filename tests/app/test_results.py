@@ -36,7 +36,7 @@ BOX = Box((-25.0, -24.0, -20.0), (25.0, 24.0, 20.0))
 AMBIENT = 1.00027
 REPORT = """<!doctype html><title>r</title><p id=said>nothing</p><script>
 const said = document.querySelector('#said'); said.textContent = 'run';
-try { parent.document.title = 'taken'; said.textContent += ' reached' } catch { said.textContent += ' kept out' }
+try { parent.document.title = 'taken'; said.textContent += ' reached' } catch { said.textContent += ' not allowed' }
 fetch('/design').then(() => { said.textContent += ' fetched' }, () => { said.textContent += ' refused' });
 </script>"""
 
@@ -45,31 +45,31 @@ def result(path: Path, voxels: int, error: float) -> None:
     """A finished result of a flame, as nerif reconstruct leaves it, with standard deviations."""
     grid = Grid.of_resolution(BOX, voxels)
     values = Flame(BOX).sample(grid)
-    field, found = VoxelField.through(values, grid), ResultDirectory(path)
-    found.begin({"measurement": "m.nc", "method": "tikhonov"})
-    found.write_field(Reconstruction(field, BOX, AMBIENT, [], Outcome("converged", "by hand"), {}))
+    field, place = VoxelField.through(values, grid), ResultDirectory(path)
+    place.begin({"measurement": "m.nc", "method": "tikhonov"})
+    place.write_field(Reconstruction(field, BOX, AMBIENT, [], Outcome("converged", "by hand"), {}))
     index = Volume.of(values * (1 + error), grid, "index_excess", AMBIENT)
     spread = Volume.of((values * 0.02).abs(), grid, "index_excess_std", AMBIENT)
-    found.write_volumes([index, spread])
+    place.write_volumes([index, spread])
     views = [
         {"name": str(i), "withheld": i == 0, "measured": "displacement", "unit": "px", "cc": 0.99, "rms": 0.01,
          "ssim": 0.99, "psnr": 40.0, "pixels": 100, "rms_predicted": 0.5, "rms_measured": 0.5} for i in range(5)
     ]  # fmt: skip
     trials = {"kind": "fast", "trials": 2, "diverged_trials": [], "seconds": 4.0}
-    found.write_metrics(Metrics(views=views, outcome="converged", seconds=12.0, uncertainty=trials))
+    place.write_metrics(Metrics(views=views, outcome="converged", seconds=12.0, uncertainty=trials))
     (path / "report.html").write_text(REPORT)
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    found = tmp_path_factory.mktemp("project")
-    result(found / "results" / "a <b>", 20, 0.0)
-    result(found / "results" / "other", 16, 0.1)
+    place = tmp_path_factory.mktemp("project")
+    result(place / "results" / "a <b>", 20, 0.0)
+    result(place / "results" / "other", 16, 0.1)
     grid = Grid.of_resolution(BOX, 12)
-    store = VolumeSequence.create(found / "film.zarr", [0.0, 1e-3, 2e-3], grid, ("index_excess",), AMBIENT)
+    store = VolumeSequence.create(place / "film.zarr", [0.0, 1e-3, 2e-3], grid, ("index_excess",), AMBIENT)
     for i in range(3):
         store.write(i, [Volume(Flame(BOX).sample(grid) * (1 - 0.4 * i), grid)])
-    return found
+    return place
 
 
 def test_what_is_listed_and_what_is_said_of_it(folder):
@@ -153,9 +153,9 @@ def tab(driver: Any, name: str) -> None:
 def pick(driver: Any, label: str, option: str) -> None:
     """Choose something by its words."""
     driver.find_element("xpath", f"//*[@aria-label='{label}']").click()
-    found = f"//div[@role='option'][contains(., '{option}')]"
-    wait_for(driver, f"return document.evaluate({found!r}, document, null, 9, null).singleNodeValue?.offsetParent")
-    driver.find_element("xpath", found).click()
+    place = f"//div[@role='option'][contains(., '{option}')]"
+    wait_for(driver, f"return document.evaluate({place!r}, document, null, 9, null).singleNodeValue?.offsetParent")
+    driver.find_element("xpath", place).click()
 
 
 def images(driver: Any) -> list[str]:
@@ -180,8 +180,8 @@ def test_two_results_side_by_side_move_together(browser, server):
     pick(browser, "Compare with", "results/other")
     wait_for(browser, "return document.querySelectorAll('.cuts img[src]').length === 9")
     assert "20 × 19 × 16 voxels" in text(browser, "main [aria-live=polite] .note")
-    said = browser.execute_script("return [...document.querySelectorAll('.bars figcaption')].map(e => e.textContent)")
-    assert said == ["results/a <b> and results/other", "results/other minus results/a <b>"]
+    labels = browser.execute_script("return [...document.querySelectorAll('.bars figcaption')].map(e => e.textContent)")
+    assert labels == ["results/a <b> and results/other", "results/other minus results/a <b>"]
     before = images(browser)
     slider = browser.find_element("css selector", "input[aria-label='Slice across z']")
     slider.send_keys(Keys.RIGHT * 3)
@@ -210,7 +210,7 @@ def test_surface_report_and_export(browser, server, folder):
     wait_for(browser, "return document.querySelector('iframe.report') !== null")
     browser.switch_to.frame(browser.find_element("css selector", "iframe.report"))
     wait_for(browser, "return document.querySelector('#said')?.textContent.split(' ').length > 3")
-    assert text(browser, "#said") == "run kept out refused"
+    assert text(browser, "#said") == "run not allowed refused"
     browser.switch_to.default_content()
     surfaces = [address for address in requests(browser) if "/surface?" in address]
     assert len(surfaces) == 2

@@ -29,15 +29,15 @@ IMAGES = ["--references", "3", "--poses", "10", "--backgrounds", "2", "--columns
 
 @pytest.fixture(scope="module")
 def project(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any], Path]:
-    """Images of four views in a project of its own; what is known of the target; the truth, out of reach."""
-    found = tmp_path_factory.mktemp("project")
+    """Images of four views in a project of its own; the properties of the target; the truth, out of reach."""
+    result = tmp_path_factory.mktemp("project")
     words = ["--phantom", "gaussians", "--views", "4", "--arc", "10", "120", *SMALL, *IMAGES, "--truth-voxels", "24"]
-    assert main(["render", "-o", str(found / "run"), *words]) == 0
-    target, truth = read_toml(found / "run" / "calibrate.toml"), tmp_path_factory.mktemp("truth") / "volume.nc"
-    shutil.move(found / "run" / "truth" / "volume.nc", truth)
-    shutil.rmtree(found / "run" / "truth")
-    (found / "run" / "calibrate.toml").unlink()
-    return found, target, truth
+    assert main(["render", "-o", str(result / "run"), *words]) == 0
+    target, truth = read_toml(result / "run" / "calibrate.toml"), tmp_path_factory.mktemp("truth") / "volume.nc"
+    shutil.move(result / "run" / "truth" / "volume.nc", truth)
+    shutil.rmtree(result / "run" / "truth")
+    (result / "run" / "calibrate.toml").unlink()
+    return result, target, truth
 
 
 def go(driver: Any, title: str) -> None:
@@ -56,10 +56,10 @@ def fill(driver: Any, name: str, value: str) -> None:
 
 def click(driver: Any, label: str) -> None:
     """Press the button with these words."""
-    found = f"//main//button[contains(., '{label}')]"
+    result = f"//main//button[contains(., '{label}')]"
     ready = "?.disabled === false"
-    wait_for(driver, f"return document.evaluate({found!r}, document, null, 9, null).singleNodeValue{ready}")
-    button = driver.find_element("xpath", found)
+    wait_for(driver, f"return document.evaluate({result!r}, document, null, 9, null).singleNodeValue{ready}")
+    button = driver.find_element("xpath", result)
     place: Any = None
     while place != (place := driver.execute_script(RESTS, button)):  # a form that unfolds moves what is below it
         time.sleep(0.15)
@@ -67,7 +67,7 @@ def click(driver: Any, label: str) -> None:
 
 
 def runs_done(driver: Any, count: int) -> None:
-    """Wait, with the drawer of runs open, until so many of them have ended well."""
+    """Wait, with the drawer of runs open, until this number of them has ended well."""
     if not driver.execute_script("return document.querySelector('.runs .run')?.checkVisibility() ?? false"):
         driver.find_element("css selector", "button[aria-label=Runs]").click()
     over = f"document.querySelectorAll('.run.done').length === {count} || document.querySelector('.run.failed')"
@@ -93,10 +93,10 @@ def test_from_images_to_an_exported_volume(browser, project):
         here = f"http://127.0.0.1:{server.port}/", f"ws://127.0.0.1:{server.port}/"
         assert [address for address in requests(browser) if not address.startswith(here)] == []
     assert time.monotonic() - begun < LONGEST
-    found, known = read_volumes(folder / "exports" / "field.nc")["index_excess"], read_volumes(truth)["index_excess"]
-    assert found.values.shape == (24, 24, 24)
-    inside = np.isfinite(found.values.numpy())
-    assert np.corrcoef(found.values.numpy()[inside], known.values.numpy()[inside])[0, 1] > 0.7
+    result, exact = read_volumes(folder / "exports" / "field.nc")["index_excess"], read_volumes(truth)["index_excess"]
+    assert result.values.shape == (24, 24, 24)
+    inside = np.isfinite(result.values.numpy())
+    assert np.corrcoef(result.values.numpy()[inside], exact.values.numpy()[inside])[0, 1] > 0.7
 
 
 def design(driver: Any) -> None:
@@ -115,7 +115,7 @@ def images(driver: Any) -> None:
 
 
 def calibration(driver: Any, target: dict[str, Any]) -> None:
-    """The target is told, found in the images, and gives four cameras."""
+    """The target is described, detected in the images, and gives four cameras."""
     go(driver, "Calibration")
     wait_for(driver, "return document.querySelector('input[name=\"target.columns\"]') !== null")
     choose(driver, "Target: kind", target["target"]["kind"])

@@ -1,4 +1,4 @@
-"""Flows drawn from a number: alike each time, ambient at the sides, with the gradient of their values."""
+"""Flows drawn from a number: the same each time, ambient at the sides, with the gradient of their values."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ with locked(Path(sys.argv[1]), inside=sys.argv[2] == "True"):
 
 
 @pytest.fixture(params=[True, False], ids=["inside", "beside"])
-def held(request, tmp_path) -> Iterator[tuple[subprocess.Popen[str], Path, bool]]:
+def holder(request, tmp_path) -> Iterator[tuple[subprocess.Popen[str], Path, bool]]:
     """Another process that holds the lock of an output, the output, and whether the lock lies in it."""
     out, inside = tmp_path / "new" / "out", request.param
     line = [sys.executable, "-c", HOLD, str(out), str(inside)]
@@ -36,8 +36,8 @@ def held(request, tmp_path) -> Iterator[tuple[subprocess.Popen[str], Path, bool]
         process.kill()
 
 
-def test_the_second_is_refused_until_the_first_has_ended(held):
-    process, out, inside = held
+def test_the_second_is_refused_until_the_first_has_ended(holder):
+    process, out, inside = holder
     with refused(out) as error, locked(out, inside):
         pass
     assert f"(process {process.pid} on " in str(error.value)
@@ -48,8 +48,8 @@ def test_the_second_is_refused_until_the_first_has_ended(held):
         assert out.parent.exists()
 
 
-def test_a_killed_process_leaves_no_lock(held):
-    process, out, inside = held
+def test_a_killed_process_leaves_no_lock(holder):
+    process, out, inside = holder
     process.kill()
     process.wait()
     with locked(out, inside):
@@ -57,8 +57,8 @@ def test_a_killed_process_leaves_no_lock(held):
     assert [path.name for path in out.parent.rglob("*")] == (["out"] if inside else [])
 
 
-def test_waiting_for_the_other(held):
-    process, out, inside = held
+def test_waiting_for_the_other(holder):
+    process, out, inside = holder
     process.stdin.close()
     with locked(out, inside, wait=True):
         pass

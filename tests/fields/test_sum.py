@@ -57,14 +57,14 @@ def test_views_are_the_path_integrals_of_the_whole(both, measurement, model, mon
     rays = measurement.rays()[0]
     expected = project(exact, total, rays)
     views = reproject(total, measurement, model=model)
-    seen = measurement.usable & measurement.sees_box
+    crossing = measurement.usable & measurement.sees_box
     scale = float(expected.square().mean().sqrt())
-    assert float((views.predicted[seen] - expected).square().mean().sqrt()) < 0.003 * scale
+    assert float((views.predicted[crossing] - expected).square().mean().sqrt()) < 0.003 * scale
     monkeypatch.setattr("nerif.analysis.prediction.EXACT_WORK", {"cpu": 0.0})
     sampled = reproject(total, measurement, model=model)
-    assert float((sampled.predicted[seen] - expected).square().mean().sqrt()) < 0.02 * scale
+    assert float((sampled.predicted[crossing] - expected).square().mean().sqrt()) < 0.02 * scale
     assert 0 < sampled.accuracies[0].error < 0.02 * scale
-    ideal = predict(total, measurement.cameras, BOX, 1.00027, model).displacement[seen]
+    ideal = predict(total, measurement.cameras, BOX, 1.00027, model).displacement[crossing]
     assert float((ideal - expected).square().mean().sqrt()) < 0.003 * scale
 
 

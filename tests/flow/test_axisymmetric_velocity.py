@@ -102,8 +102,8 @@ def test_noise_on_the_axis_is_not_that_beside_it():
     frames = 0.5**0.5 * (frames + frames.flip(-1))  # even
     evaluated = (box.grid.z < 30)[:, None, None]
     transport.weigh((frames[1:] - frames[:-1]) * evaluated)
-    found = transport.deviation.square().mean(dim=(0, 1, 2)).sqrt()
-    torch.testing.assert_close(found, 2**0.5 * size.float(), rtol=0.35, atol=0)
+    estimate = transport.deviation.square().mean(dim=(0, 1, 2)).sqrt()
+    torch.testing.assert_close(estimate, 2**0.5 * size.float(), rtol=0.35, atol=0)
 
 
 def test_grids_that_have_no_axis_are_refused():
@@ -137,13 +137,13 @@ def test_the_velocity_of_a_plume_follows_from_its_densities(film: Plume):
     assert flow.deviations is not None
     assert flow.pressure is not None
     plane = MeridionalPlane(grid_in_space(20.0, 110.0), Symmetry.about("axis", (0, 0, 0), (0, 0, 1), 1e-3))
-    found = torch.stack([plane.vector(v, flow.grid) for v in flow.velocity])
+    estimate = torch.stack([plane.vector(v, flow.grid) for v in flow.velocity])
     exact = torch.stack([plane.vector(v, grid) for v in true[frames]])
     strong = torch.stack([plane.scalar(t, grid) for t in theta[frames]]) > 0.05 * float(theta.max())
-    strong = strong[:, None].expand_as(found)
-    assert float((found - exact)[strong].norm() / exact[strong].norm()) < 0.15
+    strong = strong[:, None].expand_as(estimate)
+    assert float((estimate - exact)[strong].norm() / exact[strong].norm()) < 0.15
     deviations = torch.stack([plane.deviation(v, flow.deviations.grid) for v in flow.deviations.velocity])
-    ratio = float((found - exact)[strong].norm() / deviations[strong].norm())
+    ratio = float((estimate - exact)[strong].norm() / deviations[strong].norm())
     assert 0.2 < ratio < 3
 
 

@@ -233,10 +233,10 @@ def test_the_misfit_of_noise_is_1_at_the_true_velocity(kind: str):
         misfit = float((residual / transport.deviation)[transport.core].square().mean().sqrt())
         if weighed or kind != "grows with the scalar":  # of that the ambient fluid shows nothing
             assert 0.9 < misfit < 1.1
-    drawn = transport.sample(torch.Generator().manual_seed(1))
-    assert float((drawn / transport.deviation)[transport.core].square().mean().sqrt()) == pytest.approx(1, abs=0.1)
-    lag = drawn[:, 1:] * drawn[:, :-1]  # averages of neighbours share voxels
-    assert float(lag[transport.core[:, 1:]].mean() / drawn[transport.core].square().mean()) > 0.3
+    noisy = transport.sample(torch.Generator().manual_seed(1))
+    assert float((noisy / transport.deviation)[transport.core].square().mean().sqrt()) == pytest.approx(1, abs=0.1)
+    lag = noisy[:, 1:] * noisy[:, :-1]  # averages of neighbours share voxels
+    assert float(lag[transport.core[:, 1:]].mean() / noisy[transport.core].square().mean()) > 0.3
 
 
 def test_forces_that_stand_for_the_flow_outside_are_no_lack_of_momentum():

@@ -75,21 +75,21 @@ def balls() -> GaussianBalls:
 
 
 @pytest.fixture(scope="module")
-def taken(balls) -> Measurement:
+def shots(balls) -> Measurement:
     """Images of the balls."""
     return photographed(balls)
 
 
 @pytest.fixture(scope="module")
-def d(balls, taken) -> torch.Tensor:
+def d(balls, shots) -> torch.Tensor:
     """Displacements of the balls."""
-    return predict(balls, taken.cameras, BOX, 1.00027).displacements
+    return predict(balls, shots.cameras, BOX, 1.00027).displacements
 
 
 @pytest.fixture(scope="module")
-def both(taken, d) -> Measurement:
+def both(shots, d) -> Measurement:
     """Images and displacements."""
-    return replace(taken, displacement=d, sigma=torch.full_like(d, 0.05))
+    return replace(shots, displacement=d, sigma=torch.full_like(d, 0.05))
 
 
 def error(balls: GaussianBalls, result) -> float:
@@ -153,16 +153,16 @@ def test_gain_and_offset_are_fitted_despite_outliers():
 # -- the model -------------------------------------------------------------------------------------------------------
 
 
-def test_the_residual_of_the_truth_is_noise(taken, d):
-    rays, values, sigma = taken.rays(taken.observations[0])
-    model, d = forward_model(Images, taken), d[rays.view.long(), *rays.pixel.long().flip(-1).T]
+def test_the_residual_of_the_truth_is_noise(shots, d):
+    rays, values, sigma = shots.rays(shots.observations[0])
+    model, d = forward_model(Images, shots), d[rays.view.long(), *rays.pixel.long().flip(-1).T]
     residual, empty = (model.residual(x, values, rays) / sigma for x in (d, 0 * d))
     assert float(residual.square().mean().sqrt()) == pytest.approx(1, abs=0.12)  # noise, and the error of splines
     assert float(empty.square().mean().sqrt()) > 3
 
 
-def test_the_linear_model_is_the_slope_of_the_displaced_one(taken):
-    guessed = of_source(taken, "images", 0.0)
+def test_the_linear_model_is_the_slope_of_the_displaced_one(shots):
+    guessed = of_source(shots, "images", 0.0)
     guessed = replace(guessed, maps={**guessed.maps, GUESS: torch.full((*guessed.shape, 2), 0.3)})
     rays, values, _ = guessed.rays()
     inner = ((rays.pixel - 20).abs() < 14).all(dim=-1)
@@ -172,7 +172,7 @@ def test_the_linear_model_is_the_slope_of_the_displaced_one(taken):
     s, step = (rays.near + rays.far)[:, None] / 2, (rays.far - rays.near)[:, None]
     gradient = 1e-6 * torch.randn(len(rays), 1, 3, generator=torch.Generator().manual_seed(0))
     guess = torch.full((len(rays), 2), 0.3)
-    d = guess + LeverArm(taken.n_ambient).weights(rays, s, step)(None, gradient)
+    d = guess + LeverArm(shots.n_ambient).weights(rays, s, step)(None, gradient)
     change = model.residual(d, values, rays) - model.residual(guess, values, rays)
     assert torch.allclose(twin.weights(rays, s, step)(None, gradient), change, rtol=0.05, atol=1.0)
     # at the guess itself the residuals are equal
@@ -181,8 +181,8 @@ def test_the_linear_model_is_the_slope_of_the_displaced_one(taken):
     assert torch.allclose(at_guess, model.residual(guess, values, rays), atol=0.5)
 
 
-def test_outliers_have_the_slope_of_the_huber_loss(taken):
-    (part,) = Target.of(of_source(taken, "images")).parts
+def test_outliers_have_the_slope_of_the_huber_loss(shots):
+    (part,) = Target.of(of_source(shots, "images")).parts
     part = part[:50]
     d = torch.zeros(50, 2, requires_grad=True)
     plain = replace(part, outlier=math.inf).residual(d)
@@ -205,13 +205,13 @@ def test_missing_images_are_reported_in_one_line(balls, tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_networks_and_voxels_find_the_field_in_images(balls, taken):
-    assert error(balls, NETWORK(taken)) < 0.15
-    assert error(balls, Tikhonov(voxels=24)(taken)) < 0.25
+def test_networks_and_voxels_find_the_field_in_images(balls, shots):
+    assert error(balls, NETWORK(shots)) < 0.15
+    assert error(balls, Tikhonov(voxels=24)(shots)) < 0.25
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["taken", "both"])
+@pytest.mark.parametrize("kind", ["shots", "both"])
 def test_detail_is_added_from_images_and_from_their_displacements(balls, kind, request):
     measurement, grid = request.getfixturevalue(kind), Grid.of_resolution(BOX, 30)
     weak = VoxelField.through(0.7 * balls.sample(grid), grid)
@@ -240,7 +240,7 @@ def names_of(measurement: Measurement) -> list[str]:
 
 
 @pytest.mark.slow
-def test_images_follow_displacements(balls, taken, both, d):
+def test_images_follow_displacements(balls, shots, both, d):
     biased = replace(both, displacement=d + 0.05)
     parts = stages(biased, "auto")
     assert [names_of(part.measurement()) for part in parts[:2]] == [["deflection"], ["images"]]
@@ -250,11 +250,11 @@ def test_images_follow_displacements(balls, taken, both, d):
     assert not replace(NETWORK, source="both", max_steps=60)(biased).outcome.failed
 
 
-def test_a_run_notes_where_images_follow_and_its_pace_continues(taken, both):
+def test_a_run_notes_where_images_follow_and_its_pace_continues(shots, both):
     """There are fewer pixels of images than displacements, so fewer rays are counted from then on."""
-    flow = taken.maps["flow"].clone()
+    flow = shots.maps["flow"].clone()
     flow[:, ::2] = torch.nan
-    fewer = replace(both, maps={**taken.maps, "flow": flow})
+    fewer = replace(both, maps={**shots.maps, "flow": flow})
     settings, steps = replace(NETWORK, max_steps=12, network=NetworkShape(depth=1, width=8)), []
     Trainer(settings, TrainingData(settings, fewer)).run(steps.append)
     assert [s.step for s in steps if s.note] == [5]
@@ -271,49 +271,49 @@ def test_shifts_of_images_are_refined_from_displacements(both):
         TrainingData(replace(shifted, source="images"), both)
 
 
-def test_data_of_other_techniques_are_unchanged(balls, taken, d):
+def test_data_of_other_techniques_are_unchanged(balls, shots, d):
     """Fringes beside images and displacements, also in a view that has nothing else."""
-    fringes = predict(balls, taken.cameras, BOX, 1.00027, technique=Interferometry, wavelength_nm=532.0).maps["fringes"]
-    d, flow = d.clone(), taken.maps["flow"].clone()
+    fringes = predict(balls, shots.cameras, BOX, 1.00027, technique=Interferometry, wavelength_nm=532.0).maps["fringes"]
+    d, flow = d.clone(), shots.maps["flow"].clone()
     d[3] = flow[3] = math.nan
-    maps = {**taken.maps, "flow": flow, "fringes": fringes}
-    whole = replace(taken, displacement=d, sigma=torch.full_like(d, 0.05), wavelength_nm=532.0, maps=maps)
+    maps = {**shots.maps, "flow": flow, "fringes": fringes}
+    whole = replace(shots, displacement=d, sigma=torch.full_like(d, 0.05), wavelength_nm=532.0, maps=maps)
     image, deflection = ["images", "interferometry"], ["deflection", "interferometry"]
     sources = {"auto": image, "images": image, "displacements": deflection, "both": ["deflection", *image]}
     for source, names in sources.items():
         data = of_source(whole, source)
         assert names_of(data) == names
         assert data.names == whole.names
-    assert of_source(replace(taken, displacement=d), "displacements").names == whole.names[:3]
+    assert of_source(replace(shots, displacement=d), "displacements").names == whole.names[:3]
 
 
 @pytest.mark.slow
-def test_a_run_from_images_resumes_bit_for_bit(taken):
+def test_a_run_from_images_resumes_bit_for_bit(shots):
     settings, states = replace(NETWORK, max_steps=40, network=NetworkShape(depth=2, width=16)), {}
 
     def keep(step) -> None:
         if step.step == 25:
             states[25] = step.capture()
 
-    once = Trainer(settings, TrainingData(settings, taken)).run(keep)
-    again = Trainer(settings, TrainingData(settings, taken), states[25]).run()
+    once = Trainer(settings, TrainingData(settings, shots)).run(keep)
+    again = Trainer(settings, TrainingData(settings, shots), states[25]).run()
     a, b = (dict(r.field.network.state_dict()) for r in (once, again))
     assert all(torch.equal(a[name], b[name]) for name in a)
 
 
 @pytest.mark.slow
-def test_without_a_limit_a_run_is_judged_by_pixels_withheld(taken):
+def test_without_a_limit_a_run_is_judged_by_pixels_withheld(shots):
     settings = replace(NETWORK, max_steps=0, first_cycle=120)
-    result = settings(taken, lambda step: step.step > 121)
-    held = [row["withheld_residual"] for row in result.history if "withheld_residual" in row]
-    judges = TrainingData(settings, taken, withhold=True).withheld
+    result = settings(shots, lambda step: step.step > 121)
+    residuals = [row["withheld_residual"] for row in result.history if "withheld_residual" in row]
+    judges = TrainingData(settings, shots, withhold=True).withheld
     assert judges is not None
     assert len(judges) > 200
-    assert held[-1] < 0.5 * math.sqrt(judges.chi_square)  # the residual without a field
+    assert residuals[-1] < 0.5 * math.sqrt(judges.chi_square)  # the residual without a field
 
 
-def test_views_are_compared_as_images(balls, taken):
-    views = reproject(balls, taken, withheld=["cam1"])
+def test_views_are_compared_as_images(balls, shots):
+    views = reproject(balls, shots, withheld=["cam1"])
     scores = evaluate_views(views)
     assert {v["measured"] for v in scores} == {"flow"}
     assert [v["withheld"] for v in scores] == [v["name"] == "cam1" for v in scores]
@@ -321,14 +321,14 @@ def test_views_are_compared_as_images(balls, taken):
     assert max(v["rms_over_sigma"] for v in scores) < 1.1
 
 
-def test_threads_that_score_views_share_the_references(balls, taken, monkeypatch):
+def test_threads_that_score_views_share_the_references(balls, shots, monkeypatch):
     built, init = [], References.__init__
 
     def recorded(self, *arguments):
         built.append(threading.current_thread())
         init(self, *arguments)
 
-    views = reproject(balls, taken)
+    views = reproject(balls, shots)
     monkeypatch.setattr(References, "__init__", recorded)
     evaluate_views(views)
     assert built == [threading.main_thread()]
@@ -337,8 +337,8 @@ def test_threads_that_score_views_share_the_references(balls, taken, monkeypatch
 # -- files and invalid input -----------------------------------------------------------------------------------------
 
 
-def test_files_hold_images_beside_displacements(tmp_path, taken, both):
-    for measurement in (taken, both):
+def test_files_hold_images_beside_displacements(tmp_path, shots, both):
+    for measurement in (shots, both):
         measurement.write(tmp_path / "m.nc")
         read = Measurement.read(tmp_path / "m.nc")
         assert names_of(read) == names_of(measurement)
@@ -348,34 +348,34 @@ def test_files_hold_images_beside_displacements(tmp_path, taken, both):
         assert data["reference"].attrs["units"] == "grey value"
 
 
-def test_the_noise_of_images_may_be_given_by_attributes(taken):
-    plain = {name: value for name, value in taken.maps.items() if name != "image_sigma"}
-    dataset = replace(taken, maps=plain).to_dataset()
+def test_the_noise_of_images_may_be_given_by_attributes(shots):
+    plain = {name: value for name, value in shots.maps.items() if name != "image_sigma"}
+    dataset = replace(shots, maps=plain).to_dataset()
     dataset.attrs |= {"read_noise": 10.0, "electrons_per_grey_value": [2.0, 4.0, 4.0, 4.0]}
     sigma = Measurement.from_dataset(dataset).maps["image_sigma"]
-    grey = (taken.maps["flow"] + taken.maps["reference"]).clamp(min=0).mean(dim=(1, 2))  # as bright as each other
+    grey = (shots.maps["flow"] + shots.maps["reference"]).clamp(min=0).mean(dim=(1, 2))  # as bright as each other
     assert torch.allclose(sigma.square().mean(dim=(1, 2)), 200 + grey / torch.tensor([2.0, 4, 4, 4]), rtol=0.02)
     assert float(sigma.std() / sigma.mean()) < 0.3  # a local mean, which does not select pixels
     dataset.attrs["read_noise"] = [1.0, 2.0]
     with refused("attribute read_noise"):
         Measurement.from_dataset(dataset)
-    flow, reference = (taken.maps[name].clone() for name in ("flow", "reference"))
+    flow, reference = (shots.maps[name].clone() for name in ("flow", "reference"))
     flow[0, :3], reference[1, 5:9, 5:9] = math.nan, math.nan
     sigma = Images.complete({"flow": flow, "reference": 2 * reference}, {"read_noise": 0})["image_sigma"]
     assert torch.equal(sigma.isfinite(), flow.isfinite())
     assert torch.allclose(sigma[2:], torch.tensor(math.sqrt(1.25 / 12)), rtol=0.01)  # rounding; half the gain
 
 
-def test_missing_and_impossible_images_are_refused(taken, balls):
-    maps, displaced = taken.maps, predict(balls, taken.cameras, BOX, 1.00027)
+def test_missing_and_impossible_images_are_refused(shots, balls):
+    maps, displaced = shots.maps, predict(balls, shots.cameras, BOX, 1.00027)
     cases = [
-        ("reference", lambda: replace(taken, maps={"flow": maps["flow"]})),
-        ("reference", lambda: replace(taken, maps={**maps, "reference": maps["reference"][:, :-1]})),
-        ("flow", lambda: replace(taken, maps={**maps, "flow": torch.ones_like(maps["flow"])})),
-        ("from", lambda: of_source(taken, "displacements")),
+        ("reference", lambda: replace(shots, maps={"flow": maps["flow"]})),
+        ("reference", lambda: replace(shots, maps={**maps, "reference": maps["reference"][:, :-1]})),
+        ("flow", lambda: replace(shots, maps={**maps, "flow": torch.ones_like(maps["flow"])})),
+        ("from", lambda: of_source(shots, "displacements")),
         ("from", lambda: NeRIF(source="images")(displaced)),
         ("source", lambda: NeRIF(source="image")),
-        ("technique", lambda: predict(balls, taken.cameras, BOX, 1.00027, technique=Images)),
+        ("technique", lambda: predict(balls, shots.cameras, BOX, 1.00027, technique=Images)),
     ]
     for field, make in cases:
         with refused(field):

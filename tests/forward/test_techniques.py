@@ -269,8 +269,8 @@ class Mirage(Knife):
 
 def test_a_run_that_began_from_a_field_of_another_scale_resumes_exactly(measured, tmp_path):
     m = measured["emission"]
-    (seen,) = m.observations
-    bright = m.observed({"emission": 3 * seen.values}, {"emission": seen.sigma})
+    (observation,) = m.observations
+    bright = m.observed({"emission": 3 * observation.values}, {"emission": observation.sigma})
     settings = replace(NETWORK, max_steps=12, upper=0.5, precision="float32")
     start = replace(settings, max_steps=3)(bright).field
     whole = settings(m, start=start)
@@ -361,9 +361,9 @@ def test_bins_of_intensities_are_weighted_by_their_pixels_without_sigma(measured
 
 def test_gains_of_cameras_are_fitted(measured):
     even, gains = measured["emission"], torch.tensor([1.0, 1.3, 0.8, 1.1, 0.9])
-    found = fit_gains(with_gains(even, dict(zip(even.names, (1 / gains).tolist(), strict=True))))
-    assert [*found] == [*even.names]
-    assert torch.allclose(torch.tensor([*found.values()]), gains / gains.log().mean().exp(), rtol=0.03)
+    estimate = fit_gains(with_gains(even, dict(zip(even.names, (1 / gains).tolist(), strict=True))))
+    assert [*estimate] == [*even.names]
+    assert torch.allclose(torch.tensor([*estimate.values()]), gains / gains.log().mean().exp(), rtol=0.03)
     with refused("fit_gains"):
         fit_gains(measured["absorption"])
     with refused("fit_gains"):

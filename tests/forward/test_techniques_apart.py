@@ -42,10 +42,10 @@ def simulated(folder: Path, name: str) -> Path:
 def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """Measurements by technique, each with a result beside it of the same name; that of deflection by curved rays."""
     folder = tmp_path_factory.mktemp("techniques")
-    found = {name: simulated(folder, name) for name in ("deflection", "emission", "interferometry")}
+    measurements = {name: simulated(folder, name) for name in ("deflection", "emission", "interferometry")}
     for name in ("deflection", "emission"):
-        reconstruct_into(folder / name, found[name], QUICK, Run(report=False))
-    return found
+        reconstruct_into(folder / name, measurements[name], QUICK, Run(report=False))
+    return measurements
 
 
 def test_fields_of_another_quantity_are_refused(files, tmp_path, capsys):
@@ -74,8 +74,8 @@ def test_fields_of_another_quantity_are_refused(files, tmp_path, capsys):
 def test_settings_of_another_technique_do_not_apply(files, tmp_path, monkeypatch):
     """The model of the run stays with its technique, and the wavelength comes with the cameras of a file."""
     result, out = files["deflection"].with_suffix(""), tmp_path / "p.nc"
-    kept = ResultDirectory.settings
-    monkeypatch.setattr(ResultDirectory, "settings", lambda self: {**kept(self), "model": "curved"})
+    original = ResultDirectory.settings
+    monkeypatch.setattr(ResultDirectory, "settings", lambda self: {**original(self), "model": "curved"})
     words = ["project", str(result), "-o", str(out), "--technique", "interferometry", "--force"]
     assert main([*words, "--wavelength-nm", "532"]) == 0
     assert main([*words, "--cameras", str(files["interferometry"])]) == 0

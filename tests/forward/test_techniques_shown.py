@@ -158,10 +158,10 @@ def test_notebooks_show_each_technique(both, absorption):
 def test_mistakes_considered_are_those_that_a_technique_can_have(both, absorption):
     combined, alone = (Measurement.read(p.with_suffix(".nc")) for p in (both, absorption))
     pairs = [(o, m.cameras) for m in (combined, alone) for o in m.observations]
-    said = [[c.words for c in of_one_view(0, o, cameras)] for o, cameras in pairs]
-    assert "u and v are swapped" in said[0]
-    assert said[1] == [*said[2], "the sign is flipped"]
-    assert not any("u" in words.split() for words in said[2])
+    texts = [[c.words for c in of_one_view(0, o, cameras)] for o, cameras in pairs]
+    assert "u and v are swapped" in texts[0]
+    assert texts[1] == [*texts[2], "the sign is flipped"]
+    assert not any("u" in words.split() for words in texts[2])
     assert len(everywhere(alone.observations[0], alone.cameras)) == 2
     values = combined.observations[1].values
     for correction in of_one_view(1, combined.observations[1], combined.cameras):

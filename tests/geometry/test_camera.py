@@ -197,8 +197,8 @@ def test_pixels_beyond_the_fold_of_a_distortion_have_no_ray(k):
     xd, yd, (xx, cross, yy) = distort(x, y, coefficients)
     assert bool((xx + yy > 0).all())
     assert bool((xx * yy - cross * cross > -1e-9).all())
-    found = undistort(torch.stack([xd, yd], dim=-1)[:, :-1], coefficients)
-    assert torch.allclose(found, torch.stack([x, y], dim=-1)[:, :-1], atol=1e-5)
+    undistorted = undistort(torch.stack([xd, yd], dim=-1)[:, :-1], coefficients)
+    assert torch.allclose(undistorted, torch.stack([x, y], dim=-1)[:, :-1], atol=1e-5)
     beyond = torch.stack([xd, yd], dim=-1)[:, -1] * torch.tensor([1.02, 1.2, 3.0], dtype=F64)[:, None, None]
     assert bool(undistort(beyond, coefficients).isnan().all())
 

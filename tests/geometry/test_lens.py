@@ -17,38 +17,38 @@ RING = Ring(views=2, arc=(20.0, 70.0), elevation=6.0, image_size=(8, 10), pixel_
 
 def camera(lens: Lens | None, projection: str = "perspective"):
     """One that looks at a tilted background."""
-    found = replace(RING, projection=projection).cameras()[0]
-    normal = torch.nn.functional.normalize(found.background.normal + torch.tensor([0.0, 0.1, 0.2]).double(), dim=0)
-    return replace(found, background=Plane(normal, found.background.offset), lens=lens)
+    result = replace(RING, projection=projection).cameras()[0]
+    normal = torch.nn.functional.normalize(result.background.normal + torch.tensor([0.0, 0.1, 0.2]).double(), dim=0)
+    return replace(result, background=Plane(normal, result.background.offset), lens=lens)
 
 
 def spread(lens: Lens, projection: str = "perspective", each: int = 6):
     """The rays of all pixels, and those through points of the lens."""
-    seen = camera(lens, projection)
-    rays = seen.rays(seen.pixel_grid().reshape(-1, 2), view=3).clip(BOX)
-    return seen, rays, rays.through(spread_points(len(rays), each))
+    lensed = camera(lens, projection)
+    rays = lensed.rays(lensed.pixel_grid().reshape(-1, 2), view=3).clip(BOX)
+    return lensed, rays, rays.through(spread_points(len(rays), each))
 
 
 @pytest.mark.parametrize("projection", sorted(PROJECTIONS))
 @pytest.mark.parametrize("focus", [None, 500.0])
 def test_rays_through_a_lens_meet_where_it_is_focused(focus, projection):
     lens = Lens(12.0, focus)
-    seen, rays, through = spread(lens, projection)
+    lensed, rays, through = spread(lens, projection)
     assert len(through) == 6 * len(rays)
-    axis = seen.rotation[2]
+    axis = lensed.rotation[2]
     away = through.origin.reshape(-1, 6, 3) - rays.origin[:, None]
     assert float((away @ axis).abs().max()) < 1e-9  # across the optical axis
     assert float(away.norm(dim=-1).max()) <= 6.0
-    depth = seen.depth(seen.plane) if focus is None else focus
+    depth = lensed.depth(lensed.plane) if focus is None else focus
     if focus is None:
         ends = through.end_points.reshape(-1, 6, 3)
         assert torch.allclose(ends, rays.end_points[:, None].expand_as(ends), atol=1e-8)
     else:
-        start = through.origin - seen.centre
+        start = through.origin - lensed.centre
         reach = (depth - start @ axis) / (through.direction @ axis)
         points = (through.origin + reach[:, None] * through.direction).reshape(-1, 6, 3)
         assert float((points - points[:, :1]).abs().max()) < 1e-8
-        plane = seen.plane
+        plane = lensed.plane
         assert torch.allclose(through.end_points @ plane.normal, torch.tensor(plane.offset).double(), atol=1e-8)
     assert torch.equal(through.view, torch.full((len(through),), 3, dtype=torch.int16))
     assert torch.equal(through.pixel, rays.pixel.repeat_interleave(6, 0))
@@ -60,8 +60,8 @@ def test_rays_through_a_lens_meet_where_it_is_focused(focus, projection):
 @pytest.mark.parametrize("projection", sorted(PROJECTIONS))
 def test_all_rays_of_a_pixel_have_the_same_sensitivity_on_the_background(projection):
     """S' of a ray is S on the plane, and 0 along the ray."""
-    seen, rays, through = spread(Lens(20.0), projection, 4)
-    normal = seen.plane.normal
+    lensed, rays, through = spread(Lens(20.0), projection, 4)
+    normal = lensed.plane.normal
     along = torch.linalg.cross(normal, torch.tensor([0.3, 0.2, 0.9]).double())
     for vector in (along, torch.linalg.cross(normal, along)):
         each = (through.ends.sensitivity @ vector).reshape(-1, 4, 2)
@@ -80,8 +80,8 @@ def test_points_of_the_disc_have_its_mean(count, degree):
         for b in range(degree + 1 - a):
             around = (theta.cos() ** a * theta.sin() ** b).mean()
             expected = (2 / (a + b + 2) * around).expand(50)
-            found = (points[..., 0] ** a * points[..., 1] ** b).mean(dim=1)
-            assert torch.allclose(found, expected, atol=1e-6), (a, b)
+            result = (points[..., 0] ** a * points[..., 1] ** b).mean(dim=1)
+            assert torch.allclose(result, expected, atol=1e-6), (a, b)
     assert torch.equal(spread_points(5, 4), spread_points(5, 4))
     square = points[..., 2:]
     assert float(square.abs().max()) <= 1
@@ -93,21 +93,21 @@ def test_points_of_the_disc_have_its_mean(count, degree):
 @pytest.mark.parametrize("diameter", [0.0, 12.0])
 @pytest.mark.parametrize("projection", sorted(PROJECTIONS))
 def test_rays_over_a_window_are_those_of_its_pixels(projection, diameter):
-    seen, rays, through = spread(Lens(diameter, window=5.0), projection, 6)
-    ends, middle = seen.project(through.end_points).reshape(-1, 6, 2), rays.pixel[:, None]
+    lensed, rays, through = spread(Lens(diameter, window=5.0), projection, 6)
+    ends, middle = lensed.project(through.end_points).reshape(-1, 6, 2), rays.pixel[:, None]
     assert float((ends - middle).abs().max()) < 2.5 * 1.01  # the step to them is linear
     pixels = middle + 2.5 * spread_points(len(rays), 6)[..., 2:].double()
     assert torch.allclose(ends, pixels, atol=1e-2)
-    thin = replace(seen, lens=None).rays(pixels.reshape(-1, 2)).clip(BOX)
+    thin = replace(lensed, lens=None).rays(pixels.reshape(-1, 2)).clip(BOX)
     if diameter == 0:
         assert torch.allclose(through.direction, thin.direction, atol=1e-4)
         assert torch.allclose(through.ends.distance, thin.ends.distance, rtol=1e-4)
     blind = torch.einsum("nij,nj->ni", through.ends.sensitivity, through.direction)
     assert float(blind.abs().max()) < 1e-12
     wide = rays.half_width(0.5 * (rays.near + rays.far))
-    at = seen.pixel_size(rays.origin + 0.5 * (rays.near + rays.far)[:, None] * rays.direction)
+    at = lensed.pixel_size(rays.origin + 0.5 * (rays.near + rays.far)[:, None] * rays.direction)
     assert float(wide.min()) >= 0.9 * 2.5 * float(at.min())
-    assert seen.without_window.lens.window == 0
+    assert lensed.without_window.lens.window == 0
 
 
 def test_rays_that_end_in_front_of_the_box_have_no_weight():
@@ -118,9 +118,9 @@ def test_rays_that_end_in_front_of_the_box_have_no_weight():
     shares = cut.shares(4).reshape(-1, 4)
     crossing = cut.crosses.reshape(-1, 4).all(dim=1)
     assert torch.equal(shares[crossing], torch.tensor([0, 1, 1, 1]).double().div(3).expand(int(crossing.sum()), 4))
-    seen = torch.arange(4.0).repeat(len(rays))[:, None].double()
-    assert torch.allclose(cut.mean_of(4, seen)[crossing], torch.tensor(2.0).double())
-    assert torch.allclose(through.mean_of(4, seen), torch.tensor(1.5).double())
+    lensed = torch.arange(4.0).repeat(len(rays))[:, None].double()
+    assert torch.allclose(cut.mean_of(4, lensed)[crossing], torch.tensor(2.0).double())
+    assert torch.allclose(through.mean_of(4, lensed), torch.tensor(1.5).double())
 
 
 def test_a_lens_by_its_f_number():
@@ -155,19 +155,19 @@ def test_lenses_that_cannot_be(wrong, field):
 
 
 def test_thin_rays_pass_no_lens():
-    seen = camera(None)
+    lensed = camera(None)
     with refused("aperture_diameter"):
-        seen.rays(seen.pixel_grid().reshape(-1, 2)).through(torch.zeros(80, 1, 4))
+        lensed.rays(lensed.pixel_grid().reshape(-1, 2)).through(torch.zeros(80, 1, 4))
 
 
 def test_where_a_telecentric_camera_counts_its_depth_from_changes_nothing():
     """z_cam = 0 before, in and behind the flow, the diameter of the cone there with it."""
     depth = camera(None).depth(camera(None).plane)
-    seen, disc = camera(Lens(12.0, depth), "telecentric"), torch.tensor([[[0.6, -0.3, 0.0, 0.0], [0.0] * 4]]).double()
+    lensed, disc = camera(Lens(12.0, depth), "telecentric"), torch.tensor([[[0.6, -0.3, 0.0, 0.0], [0.0] * 4]]).double()
     pixel = torch.tensor([[4.0, 3.0]], dtype=torch.float64)
-    first = seen.rays(pixel).clip(BOX).through(disc)
+    first = lensed.rays(pixel).clip(BOX).through(disc)
     for shift in (700.0, depth + 300.0):
-        moved = replace(seen, translation=seen.translation - torch.tensor([0.0, 0.0, shift]).double())
+        moved = replace(lensed, translation=lensed.translation - torch.tensor([0.0, 0.0, shift]).double())
         moved = replace(moved, lens=Lens(12.0 * abs(1 - shift / depth), depth - shift))
         turned = disc if shift < depth else -disc  # beyond the focus the cone is upside down
         other = moved.rays(pixel).clip(BOX).through(turned)

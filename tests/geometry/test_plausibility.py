@@ -87,18 +87,18 @@ def test_without_a_likely_cause_the_general_checks_are_named():
 
 @pytest.mark.parametrize("which", [(0, 1, 2, 3, 4), (1,), (1, 3)])
 def test_cameras_inside_the_box_are_named(which):
-    (found,) = rig_findings([in_metres(c) if i in which else c for i, c in enumerate(ring())], BOX)
-    assert found.code == "inside"
-    assert found.views == tuple(ring()[i].name for i in which)
-    assert "likely translation in metres" in found.sentence
+    (finding,) = rig_findings([in_metres(c) if i in which else c for i, c in enumerate(ring())], BOX)
+    assert finding.code == "inside"
+    assert finding.views == tuple(ring()[i].name for i in which)
+    assert "likely translation in metres" in finding.sentence
 
 
 def test_a_camera_that_looks_past_the_box_is_named():
     cameras = list(general())
     cameras[2] = of_opengl(cameras[2])
-    (found,) = rig_findings(cameras, BOX)
-    assert (found.code, found.views) == ("beside", ("cam2",))
-    assert "likely axes of OpenGL" in found.sentence
+    (finding,) = rig_findings(cameras, BOX)
+    assert (finding.code, finding.views) == ("beside", ("cam2",))
+    assert "likely axes of OpenGL" in finding.sentence
 
 
 @pytest.mark.parametrize(("edge", "code"), [(0.05, "small_box"), (5e4, "large_box")])
@@ -109,14 +109,14 @@ def test_a_box_of_another_unit_is_named(edge, code):
         replace(c, translation=factor * c.translation, background=Plane(c.plane.normal, factor * c.plane.offset))
         for c in paper_rig(16)[0]
     ]
-    assert [found.code for found in rig_findings(cameras, Box.cube(edge))] == [code]
+    assert [finding.code for finding in rig_findings(cameras, Box.cube(edge))] == [code]
 
 
 def test_a_view_whose_rays_pass_beside_all_others_is_named():
     low, high = (Ring(views=3, image_size=(40, 48), pixel_pitch=0.09).cameras() for _ in range(2))
     cameras = [c.view(0, 0, 18, 48) for c in low[:2]] + [high[2].view(24, 0, 16, 48)]
-    (found,) = rig_findings(cameras, BOX)
-    assert (found.code, found.views) == ("apart", ("170deg",))
+    (finding,) = rig_findings(cameras, BOX)
+    assert (finding.code, finding.views) == ("apart", ("170deg",))
 
 
 RIGHT = {

@@ -71,9 +71,9 @@ def test_a_rig_may_mix_cameras_with_and_without_a_beginning_of_their_rays(order)
     assert bool((rays.near[half : half + 50] < -5).any())  # its plane z_cam = 0 cuts the box
     moved = Corrections(cameras, torch.zeros(2, len(GEOMETRY))).apply(rays, BOX)
     through = rays.spread(1)
-    for found in (moved, through, rays[torch.arange(100)]):
-        assert torch.allclose(found.near, rays.near, atol=1e-9)
-        assert torch.allclose(found.far, rays.far, atol=1e-9)
+    for part in (moved, through, rays[torch.arange(100)]):
+        assert torch.allclose(part.near, rays.near, atol=1e-9)
+        assert torch.allclose(part.far, rays.far, atol=1e-9)
 
 
 def test_records_that_differ_in_what_is_no_array_are_not_joined():

@@ -85,8 +85,8 @@ def test_paper_rig():
         assert float(c.rays(torch.tensor([[99.5, 99.5]], dtype=F64)).ends.distance) == pytest.approx(1200.0)
     first = cameras[0]
     corners = torch.tensor([[x, y, z] for x in (-25, 25) for y in (-25, 25) for z in (-25, 25)], dtype=F64)
-    seen = first.project(corners)
-    assert 0 < float(seen.min()) < float(seen.max()) < 199  # the cube is seen whole
+    pixels = first.project(corners)
+    assert 0 < float(pixels.min()) < float(pixels.max()) < 199  # the cube is seen whole
     assert first.centre.tolist() == pytest.approx([700.0, 0.0, 0.0])
 
 

@@ -18,9 +18,9 @@ SIDES = ("x-", "x+", "y-", "y+")
 
 
 def about(text="axis", point=(1.0, 2.0, 0.0), direction=(0.1, -0.05, 1.0), rounding=0.1):
-    found = Symmetry.about(text, point, direction, rounding)
-    assert found is not None
-    return found
+    rounded = Symmetry.about(text, point, direction, rounding)
+    assert rounded is not None
+    return rounded
 
 
 @pytest.mark.parametrize(("text", "parsed"), [("none", None), ("axis", ("axis", 0)), ("axis+3", ("axis", 3))])
@@ -43,8 +43,8 @@ def test_coordinates_do_not_depend_on_the_azimuth():
     symmetry, angle = about(rounding=1e-6), torch.tensor(1.1, dtype=torch.float64)
     r, h = torch.tensor([0.0, 3.0, 9.0], dtype=torch.float64), torch.tensor([-4.0, 0.0, 11.0], dtype=torch.float64)
     for turn in (0.0, 0.4, 2.0):
-        found = symmetry.reduced(symmetry.places(r, angle + turn, h))
-        assert torch.allclose(found, torch.stack([r, torch.zeros(3), h], dim=1).double(), atol=1e-5)
+        rounded = symmetry.reduced(symmetry.places(r, angle + turn, h))
+        assert torch.allclose(rounded, torch.stack([r, torch.zeros(3), h], dim=1).double(), atol=1e-5)
 
 
 def test_coordinates_of_a_planar_field_are_constant_along_its_direction():

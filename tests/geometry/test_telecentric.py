@@ -55,7 +55,7 @@ CAMERAS = ring()
 
 
 @pytest.fixture(scope="module")
-def seen(ball, box) -> Measurement:
+def simulated(ball, box) -> Measurement:
     return simulate(ball, tuple(through_the_origin(c) for c in CAMERAS), box, AMBIENT, noise=0.02, seed=5, steps=60)
 
 
@@ -86,8 +86,8 @@ TECHNIQUE_NAMES = sorted(name for name, kind in TECHNIQUES.items() if not kind.d
     ("kind", "technique", "rows"),
     [("perspective", "deflection", 1), *(("telecentric", name, rows) for name in TECHNIQUE_NAMES for rows in (1, 20))],
 )
-def test_the_adjoint_of_the_voxel_operator_is_exact(seen, box, kind, technique, rows):
-    model = forward_model(TECHNIQUES[technique], replace(seen, wavelength_nm=532.0))
+def test_the_adjoint_of_the_voxel_operator_is_exact(simulated, box, kind, technique, rows):
+    model = forward_model(TECHNIQUES[technique], replace(simulated, wavelength_nm=532.0))
     rays = Rays.concatenate([c.rays(c.pixel_grid().reshape(-1, 2)).clip(box) for c in ring(kind, rows)])
     a = VoxelOperator(
         rays[rays.crosses], Grid(box, (9, 11, 13)), model, boundary=Boundary(("x-", "y+")), dtype=torch.float64
@@ -100,8 +100,8 @@ def test_the_adjoint_of_the_voxel_operator_is_exact(seen, box, kind, technique, 
     assert abs(float((forward * d).sum() - (c * back).sum())) <= 1e-12 * float(forward.norm() * d.norm())
 
 
-def test_the_file_keeps_the_projection_of_each_view(seen, tmp_path):
-    mixed = replace(seen, cameras=(*ring("perspective")[:1], *seen.cameras[1:]))
+def test_the_file_keeps_the_projection_of_each_view(simulated, tmp_path):
+    mixed = replace(simulated, cameras=(*ring("perspective")[:1], *simulated.cameras[1:]))
     mixed.write(tmp_path / "m.nc")
     again = Measurement.read(tmp_path / "m.nc")
     assert [c.projection for c in again.cameras] == [c.projection for c in mixed.cameras]
@@ -119,8 +119,8 @@ def test_the_file_keeps_the_projection_of_each_view(seen, tmp_path):
 
 
 @pytest.mark.parametrize("characters", [True, False])
-def test_names_in_characters_or_of_fixed_length_are_read(seen, tmp_path, characters):
-    dataset = seen.to_dataset()
+def test_names_in_characters_or_of_fixed_length_are_read(simulated, tmp_path, characters):
+    dataset = simulated.to_dataset()
     dataset["projection"] = (("view",), np.array([b"telecentric"] * len(CAMERAS)))
     dataset["view"] = (("view",), np.array([c.name.encode() for c in CAMERAS]))
     dataset.to_netcdf(tmp_path / "m.nc", engine="h5netcdf")  # as arrays of characters
@@ -134,8 +134,8 @@ def test_names_in_characters_or_of_fixed_length_are_read(seen, tmp_path, charact
     assert again.names == tuple(c.name for c in CAMERAS)
 
 
-def test_scales_are_in_pixels_a_millimetre(seen):
-    dataset = seen.to_dataset()
+def test_scales_are_in_pixels_a_millimetre(simulated):
+    dataset = simulated.to_dataset()
     assert dataset["intrinsics"].attrs["units"] == "px mm-1"
     for unit in ("px", "px/mm"):
         dataset["intrinsics"].attrs["units"] = unit
@@ -149,15 +149,15 @@ def test_scales_are_in_pixels_a_millimetre(seen):
         Measurement.from_dataset(pinholes)
 
 
-def test_a_field_comes_back_and_is_seen_again(seen, ball, box):
-    result = Tikhonov(voxels=14, device="cpu")(seen)
+def test_a_field_comes_back_and_is_seen_again(simulated, ball, box):
+    result = Tikhonov(voxels=14, device="cpu")(simulated)
     grid = Grid.of_resolution(box, 14)
-    truth, found = ball.sample(grid).double(), result.field.sample(grid).double()
-    assert float((truth - found).norm() / truth.norm()) < 0.28  # 0.255, as of perspective cameras
-    again = reproject(result.field, seen)
-    usable = seen.usable
-    left = (again.predicted - seen.displacement)[usable]
-    assert float(left.norm() / seen.displacement[usable].norm()) < 0.07  # 0.057
+    truth, estimate = ball.sample(grid).double(), result.field.sample(grid).double()
+    assert float((truth - estimate).norm() / truth.norm()) < 0.28  # 0.255, as of perspective cameras
+    again = reproject(result.field, simulated)
+    usable = simulated.usable
+    left = (again.predicted - simulated.displacement)[usable]
+    assert float(left.norm() / simulated.displacement[usable].norm()) < 0.07  # 0.057
 
 
 def test_a_run_is_not_resumed_with_another_projection():
@@ -166,12 +166,12 @@ def test_a_run_is_not_resumed_with_another_projection():
     assert digest(_parts(camera)) != digest(_parts(replace(camera, projection=TELECENTRIC)))
 
 
-def test_a_background_before_the_box_is_refused(seen):
-    plane = seen.cameras[2].plane
+def test_a_background_before_the_box_is_refused(simulated):
+    plane = simulated.cameras[2].plane
     for offset in (-plane.offset, 3.0):
-        wrong = replace(seen.cameras[2], background=replace(plane, offset=offset))
+        wrong = replace(simulated.cameras[2], background=replace(plane, offset=offset))
         with pytest.raises(InputError, match="background of view '72deg': expected a plane behind the box"):
-            replace(seen, cameras=(*seen.cameras[:2], wrong, *seen.cameras[3:]))
+            replace(simulated, cameras=(*simulated.cameras[:2], wrong, *simulated.cameras[3:]))
 
 
 def test_one_row_is_a_image(ball, box):
@@ -233,23 +233,23 @@ def test_cameras_are_drawn_before_what_they_look_at(kind, background):
 
 
 @pytest.mark.parametrize("background", [True, False])
-def test_the_page_draws_beams_that_end(seen, tmp_path, background):
+def test_the_page_draws_beams_that_end(simulated, tmp_path, background):
     """What the 3-D view of the report is given: json that a browser reads, so no infinite number."""
-    m = seen
+    m = simulated
     if not background:
-        cameras = tuple(replace(c, background=None) for c in seen.cameras)
-        m = measurement_of({Absorption: torch.zeros(5, 20, 26, 1)}, cameras, seen.box, AMBIENT)
-    values, grid = torch.linspace(-1e-4, 0, 4**3).reshape(4, 4, 4), Grid(seen.box, (4, 4, 4))
+        cameras = tuple(replace(c, background=None) for c in simulated.cameras)
+        m = measurement_of({Absorption: torch.zeros(5, 20, 26, 1)}, cameras, simulated.box, AMBIENT)
+    values, grid = torch.linspace(-1e-4, 0, 4**3).reshape(4, 4, 4), Grid(simulated.box, (4, 4, 4))
     excess = Volume(values, grid, attributes={"n_ambient": AMBIENT})
     volumes = {"index_excess": excess, "n": derive(excess, "n", GasSettings())}
     scene, _ = scene_of(Result(tmp_path, measurement=m, volumes=volumes))
     assert scene is not None
-    drawn = json.loads(json.dumps(scene, allow_nan=False))
-    assert drawn["backgrounds"] == background
-    assert len(drawn["cameras"]) == 5
-    for camera, own in zip(drawn["cameras"], m.cameras, strict=True):
+    plain = json.loads(json.dumps(scene, allow_nan=False))
+    assert plain["backgrounds"] == background
+    assert len(plain["cameras"]) == 5
+    for camera, original in zip(plain["cameras"], m.cameras, strict=True):
         starts, ends, directions = (np.array(camera[k]) for k in ("starts", "ends", "directions"))
-        axis = own.rotation[2].numpy()
+        axis = original.rotation[2].numpy()
         assert np.allclose(directions, axis, atol=1e-5)  # a beam
         assert np.ptp(starts, axis=0).max() > 20  # mm
         assert (starts @ axis).max() < -20

@@ -118,9 +118,9 @@ def test_predictions_have_no_value_where_a_body_hides_the_background(with_ball):
 def test_ambient_points_and_hull_respect_bodies(flow):
     body = cuboid((10.0, -10.0, -10.0), (25.0, 10.0, 10.0))  # through the face x+
     region = Gauge.of(with_bodies(replace(flow, ambient_faces=("x+",)), [body]))
-    drawn, _ = region.sample(2000, torch.Generator().manual_seed(0))
-    assert not bool(contained([body], drawn).any())
-    assert 500 < len(drawn) < 2000
+    points_inside, _ = region.sample(2000, torch.Generator().manual_seed(0))
+    assert not bool(contained([body], points_inside).any())
+    assert 500 < len(points_inside) < 2000
     with refused("ambient_faces"):
         Gauge.of(replace(flow, ambient_faces=("x+",), bodies=(cuboid((15.0, -30.0, -30.0), (25.0, 30.0, 30.0)),)))
     grid = Grid.of_resolution(BOX, 20)

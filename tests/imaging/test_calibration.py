@@ -96,9 +96,9 @@ def test_exact_points_give_the_rig_back(exact, kind):
     assert result.rms() < 1e-4
     assert turns(result, RIGS[kind]).max() < 1e-3
     points = torch.from_numpy(np.random.default_rng(0).uniform(-20, 20, (50, 3)))
-    for camera, found, k in zip(RIGS[kind], result.cameras, result.intrinsics, strict=True):
-        whole = found.camera(background=camera.background)
-        assert found.projection == camera.projection
+    for camera, estimate, k in zip(RIGS[kind], result.cameras, result.intrinsics, strict=True):
+        whole = estimate.camera(background=camera.background)
+        assert estimate.projection == camera.projection
         assert float((whole.project(points) - camera.project(points)).abs().max()) < 2e-3
         assert np.allclose(k[:2], camera.intrinsics[[0, 1], [0, 1]].numpy(), rtol=2e-5)
 
@@ -136,10 +136,10 @@ def test_pose_errors_about_the_cameras_axes_are_about_pose_sigma(noisy):
     """Noise alone, without the mount: the prior of a refinement."""
     result = replace(noisy["perspective"], mount=(0.0, 0.0))
     errors = []
-    for camera, found in zip(CAMERAS, result.cameras, strict=True):
-        turn = Rotation.from_matrix((camera.rotation @ found.rotation.T).numpy()).as_rotvec()
-        shift = found.rotation @ (camera.centre + found.rotation.T @ found.translation)
-        errors.append(np.concatenate([turn, shift.numpy()]) / found.pose_sigma.numpy())
+    for camera, estimate in zip(CAMERAS, result.cameras, strict=True):
+        turn = Rotation.from_matrix((camera.rotation @ estimate.rotation.T).numpy()).as_rotvec()
+        shift = estimate.rotation @ (camera.centre + estimate.rotation.T @ estimate.translation)
+        errors.append(np.concatenate([turn, shift.numpy()]) / estimate.pose_sigma.numpy())
     assert np.abs(errors).max() < 4
     assert 0.4 < np.sqrt(np.mean(np.square(errors))) < 1.6
 
@@ -319,7 +319,7 @@ def test_pose_sigma_is_for_the_tilt_as_it_is():
 
 @pytest.mark.slow
 def test_the_reprojection_error_is_that_of_opencv():
-    """One camera of the same parameters; where images hardly tell tilt and principal point apart, they may differ."""
+    """One camera of the same parameters; where images hardly distinguish tilt from principal point, they may differ."""
     (view,) = target_images(tilted_pair(TILTS)[:1], TARGET, NOISE, 14)
     result = calibrate([view], SCHEIMPFLUG)
     images = [*view.poses.values(), *view.background.values()]

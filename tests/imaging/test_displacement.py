@@ -151,8 +151,8 @@ def test_a_camera_that_moved_far_is_found_first(pattern, truth, movement, width)
     result = measure(references, [flow], DisplacementSettings(shake_border=width))
     error = np.linalg.norm(result.displacement - (truth if width else truth + shake), axis=-1)
     row, column = ROWS - shake[..., 1], COLUMNS - shake[..., 0]
-    seen = (row > 8) & (row < SHAPE[0] - 8) & (column > 8) & (column < SHAPE[1] - 8)
-    assert result.valid[seen].mean() > 0.95
+    interior = (row > 8) & (row < SHAPE[0] - 8) & (column > 8) & (column < SHAPE[1] - 8)
+    assert result.valid[interior].mean() > 0.95
     assert np.sqrt(np.mean(error[result.valid] ** 2)) < 0.1
     assert np.allclose(result.shift, (u, v), atol=1.5)
     assert not result.valid[(row < -1) | (column < -1) | (row > SHAPE[0]) | (column > SHAPE[1])].any()

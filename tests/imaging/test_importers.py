@@ -225,7 +225,7 @@ def test_image_size_and_background_come_from_file_settings_or_caller(tmp_path):
 
 
 def table_of(camera: Camera, scale: float = 1.0, **more: Any) -> dict[str, Any]:
-    """A plain table, in a unit of so many mm."""
+    """A plain table, in a unit in mm."""
     a = arrays(camera)
     return {"K": a["K"].tolist(), "R": a["R"].tolist(), "t": (a["t"] / scale).tolist(), "distortion": a["D"].tolist(),
             **more}  # fmt: skip
@@ -523,7 +523,7 @@ RIGHT = beside(ONE)
 
 
 def rectified(unit: float = 1.0, **more: Any) -> tuple[np.ndarray, ...]:
-    """R, T, R1, R2, P1, P2, Q of ONE and RIGHT by cv2.stereoRectify, in a unit of so many mm."""
+    """R, T, R1, R2, P1, P2, Q of ONE and RIGHT by cv2.stereoRectify, in a unit in mm."""
     a, b = arrays(ONE), arrays(RIGHT)
     rotation = b["R"] @ a["R"].T
     shift = (b["t"] - rotation @ a["t"])[:, None] / unit

@@ -206,7 +206,7 @@ def test_a_cell_with_a_saturated_pixel_is_saturated(shift):
     assert over.sum() == 10 * 11
 
 
-def test_reference_and_flow_are_binned_alike(tmp_path, rng, lines):
+def test_reference_and_flow_have_the_same_bins(tmp_path, rng, lines):
     view = write_raw(tmp_path, dots(rng), "BGGR", rng, flow=0 * dots(rng))
     assert not open_frames(tmp_path / "cam1" / "flow.tif").layout.pattern  # black
     reference, flow = view.open("reference"), view.open("flow")

@@ -233,9 +233,9 @@ def test_frames_missing_in_the_times_of_a_film_are_gaps(tmp_path):
     for name, dropped in (("a", 3), ("b", 5)):
         (tmp_path / name).mkdir()
         with h5py.File(tmp_path / name / "flow.h5", "w") as file:
-            kept = np.delete(np.arange(8), dropped)
-            file["images"] = np.broadcast_to(kept[:, None, None], (7, *BLANK.shape)).astype(np.uint8)
-            file["times"] = 12.5 + 0.002 * kept + 1e-5 * np.sin(kept)
+            remaining = np.delete(np.arange(8), dropped)
+            file["images"] = np.broadcast_to(remaining[:, None, None], (7, *BLANK.shape)).astype(np.uint8)
+            file["times"] = 12.5 + 0.002 * remaining + 1e-5 * np.sin(remaining)
     views = paired(find_views(tmp_path))
     assert [int(view.flow_image(6)[0][0, 0]) for view in views] == [6, 6]
     numbers = frame_numbers("all", views)

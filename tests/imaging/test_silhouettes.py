@@ -54,8 +54,8 @@ def test_an_outline_is_halfway_between_pixels():
 
 def test_the_pose_of_a_body_is_that_of_its_outlines(flow):
     there = turned(BRICK)
-    seen = with_bodies(flow, [there])
-    pose = refine_pose(replace(flow, displacement=seen.displacement), BRICK)
+    masked = with_bodies(flow, [there])
+    pose = refine_pose(replace(flow, displacement=masked.displacement), BRICK)
     assert pose.unknown == ()
     assert float((pose.body.vertices - there.vertices).norm(dim=1).max()) < 0.3  # mm; a pixel is 0.7 mm
     errors = pose.turn - torch.tensor([2.0, -3.0, 1.5]).deg2rad()
@@ -66,17 +66,17 @@ def test_the_pose_of_a_body_is_that_of_its_outlines(flow):
 
 def test_turns_of_a_ball_are_not_determined(flow):
     there = ball(6.0, (1.0, -2.0, 0.5))
-    seen = with_bodies(flow, [there])
-    pose = refine_pose(seen, ball(6.0, (0.2, -1.5, 0.0)))
+    masked = with_bodies(flow, [there])
+    pose = refine_pose(masked, ball(6.0, (0.2, -1.5, 0.0)))
     assert {name for name in pose.unknown if name.startswith("turn")} == {f"turn about {axis}" for axis in "xyz"}
     torch.testing.assert_close(pose.body.vertices.mean(dim=0), there.vertices.mean(dim=0), atol=0.15, rtol=0)
     assert "not determined: turn about" in pose.sentence
 
 
 def test_an_outline_far_away_is_refused(flow):
-    seen = with_bodies(flow, [BRICK])
+    masked = with_bodies(flow, [BRICK])
     with refused("brick") as error:
-        refine_pose(seen, turned(BRICK, shift=(0.0, 0.0, 17.0)))
+        refine_pose(masked, turned(BRICK, shift=(0.0, 0.0, 17.0)))
     assert "--refine needs pixels without data where the body is" in str(error.value)
     with refused("brick") as error:
         refine_pose(flow, BRICK)
@@ -163,13 +163,13 @@ def test_a_body_that_moves_in_a_film(film, tmp_path, capsys):
 
 
 def test_the_pose_in_each_frame_is_refined(flow, film, tmp_path):
-    seen = MeasurementSequence.create(tmp_path / "seen.zarr", film.times, flow)
+    masked = MeasurementSequence.create(tmp_path / "seen.zarr", film.times, flow)
     places = [(0.0, 0.0, 0.0), (0.8, -0.5, 0.4)]
     for index, shift in enumerate(places):
-        seen.write_frame(
+        masked.write_frame(
             index, replace(flow, displacement=with_bodies(flow, [turned(BRICK, shift=shift)]).displacement)
         )
-    whole = film_with_bodies(seen, tmp_path / "refined.zarr", [BRICK], refine=True)
+    whole = film_with_bodies(masked, tmp_path / "refined.zarr", [BRICK], refine=True)
     for index, shift in enumerate(places):
         (body,) = whole.frame(index).bodies
         expected = turned(BRICK, shift=shift).vertices.mean(dim=0)

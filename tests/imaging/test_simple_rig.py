@@ -47,8 +47,8 @@ def test_the_axis_is_imaged_where_it_was_marked(axis, middle):
     assert abs((np.array(middle or (119.5, 159.5)) - foot) @ along) < 1e-9  # nearest the principal point
     heights = [0.1 * float((end - foot) @ along) for end in (first, last)]
     assert heights[1] - heights[0] == pytest.approx(0.1 * math.dist(*axis))
-    seen = camera.project(points(*((0, 0, z) for z in heights))).numpy()
-    assert np.abs(seen - [first, last]).max() < 1e-6
+    pixels = camera.project(points(*((0, 0, z) for z in heights))).numpy()
+    assert np.abs(pixels - [first, last]).max() < 1e-6
     assert torch.det(camera.rotation) == pytest.approx(1)
 
 
@@ -76,9 +76,9 @@ def test_a_focal_length_gives_the_same_scale_as_a_ruler():
     assert torch.allclose(by_lens.intrinsics, by_ruler.intrinsics)
     assert torch.allclose(by_lens.translation, by_ruler.translation)
     assert by_lens.lens == Lens(6.25)
-    known = dataclasses.replace(BEHIND, aperture_diameter=5.0, focus_distance=900.0, pose_sigma_mm=3.0,
+    with_lens = dataclasses.replace(BEHIND, aperture_diameter=5.0, focus_distance=900.0, pose_sigma_mm=3.0,
                                 pose_sigma_deg=0.2)  # fmt: skip
-    camera = simple_camera(RULED, SIZE, known)
+    camera = simple_camera(RULED, SIZE, with_lens)
     assert camera.lens == Lens(5.0, 900.0)
     assert camera.pose_sigma is not None
     assert float(camera.pose_sigma[5]) == 3

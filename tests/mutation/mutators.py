@@ -186,9 +186,9 @@ WORDS += (b"[]", b"{}", b"", b"null", b"[1, 2]")
 def spoil_text(path: Path, rng: random.Random) -> str:
     """Put something else in the place of one number, or drop or double a line."""
     content = path.read_bytes()
-    found = list(NUMBER.finditer(content[:20000]))
-    if found and rng.random() < 0.7:
-        hit, word = rng.choice(found), rng.choice(WORDS)
+    matches = list(NUMBER.finditer(content[:20000]))
+    if matches and rng.random() < 0.7:
+        hit, word = rng.choice(matches), rng.choice(WORDS)
         path.write_bytes(content[: hit.start()] + word + content[hit.end() :])
         return f"{hit.group().decode()} at {hit.start()} became {word.decode()!r}"
     lines = content.splitlines(keepends=True)

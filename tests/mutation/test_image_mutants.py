@@ -46,7 +46,7 @@ def lzw(path: Path) -> None:
     images[0].save(path, save_all=True, append_images=images[1:], compression="tiff_lzw")
 
 
-def picture(path: Path) -> None:
+def one_image(path: Path) -> None:
     write_cv(path, (STACK[0] >> 4).astype(np.uint8))
 
 
@@ -93,9 +93,9 @@ KINDS: dict[str, Callable[[Path], None]] = {
     "imagej.tif": tiff(imagej=True),
     "deflate.tif": tiff(compression="zlib", photometric="miniswhite"),
     "lzw.tif": lzw,
-    "grey.png": picture,
-    "grey.bmp": picture,
-    "grey.jpg": picture,
+    "grey.png": one_image,
+    "grey.bmp": one_image,
+    "grey.jpg": one_image,
     "film.cihx": photron,
     "packed.tif": lambda path: write_packed_tiff(path, STACK >> 2, 10, 5),
     "film.cine": cine,

@@ -71,12 +71,12 @@ def of_volume(path: Path) -> torch.Tensor:
 
 def of_calibration(path: Path) -> torch.Tensor:
     pixels = torch.tensor([[0.0, 0.0], [4.0, 3.0]], dtype=torch.float64)
-    found = []
+    problems = []
     for camera in import_cameras(path):
         whole = camera.camera(camera.image_size or (8, 10), camera.background or RIG[0].background)
         rays = whole.rays(pixels).clip(BOX)
-        found += [rays.origin, rays.direction, rays.near, rays.far]
-    return torch.cat([f.reshape(-1) for f in found])
+        problems += [rays.origin, rays.direction, rays.near, rays.far]
+    return torch.cat([f.reshape(-1) for f in problems])
 
 
 def of_film(path: Path) -> torch.Tensor:
@@ -101,8 +101,8 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("good")
     ball = GaussianBalls(torch.zeros(1, 3).double(), torch.tensor([1.5]).double(), torch.tensor([-2e-4]).double())
     m = simulate(ball, RIG, BOX, 1.00027, noise=0.05, steps=8, wavelength_nm=532.0)
-    seen = torch.ones(m.displacement.shape[:3], dtype=torch.bool)
-    m = replace(m, valid=seen, flow_mask=seen)
+    visible = torch.ones(m.displacement.shape[:3], dtype=torch.bool)
+    m = replace(m, valid=visible, flow_mask=visible)
     m.write(folder / "m.nc")
     grid = Grid.of_resolution(BOX, 6)
     volumes = [
@@ -203,12 +203,12 @@ def remove(path: Path) -> None:
 @pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize("kind", OUTCOMES)
 def test_mutants_are_refused_in_one_line_or_give_a_finite_field(good, kind, tmp_path, capfd):
-    found, refused = [], []
+    problems, refused = [], []
     for number in range(QUICK):
         path, line, wrong = outcome(good, kind, number, tmp_path)
-        found += [wrong] if wrong else []
+        problems += [wrong] if wrong else []
         refused += [path] if line else []
-    assert not found, "\n".join(found)
+    assert not problems, "\n".join(problems)
     assert 0 < len(refused) < QUICK
     assert capfd.readouterr().err == ""  # no library has its own say
     if kind in ("m.nc", "v.vti", "r.zarr"):
@@ -224,12 +224,12 @@ BLOCKS = [(kind, first) for kind, count in MANY.items() for first in range(0, co
 @pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize(("kind", "first"), BLOCKS)
 def test_ten_thousand_mutants(good, kind, first, tmp_path):
-    found = []
+    problems = []
     for number in range(first, min(first + BLOCK, MANY[kind])):
         path, _, wrong = outcome(good, kind, number, tmp_path)
-        found += [wrong] if wrong else []
+        problems += [wrong] if wrong else []
         remove(path)
-    assert not found, "\n".join(found)
+    assert not problems, "\n".join(problems)
 
 
 def test_there_are_ten_thousand():

@@ -61,9 +61,9 @@ def test_one_rms_is_of_rays_that_cross_the_box(measurement, tmp_path, capsys):
 
 @pytest.mark.parametrize("name", nerif.__all__)
 def test_every_name_is_there_and_at_home(name):
-    found = getattr(nerif, name)
+    member = getattr(nerif, name)
     assert name in dir(nerif)
-    assert found is getattr(sys.modules[found.__module__], name)
+    assert member is getattr(sys.modules[member.__module__], name)
 
 
 def test_names_are_loaded_when_first_used():
@@ -117,13 +117,13 @@ def coloured(pixels: np.ndarray) -> float:
 
 
 def test_a_measurement_shows_its_views(measurement: Measurement):
-    shown = Panel(measurement._repr_html_())
-    cells = " | ".join(shown.cells)
+    view = Panel(measurement._repr_html_())
+    cells = " | ".join(view.cells)
     for words in ("Views | 5, 28 × 22 px", "Displacement | rms", "Noise σ | rms", "24 × 20 × 16 mm", "1.00027"):
         assert words in cells
-    assert coloured(shown.pixels) > 0.02
+    assert coloured(view.pixels) > 0.02
     still = replace(measurement, displacement=torch.zeros_like(measurement.displacement))
-    assert coloured(Panel(still._repr_html_()).pixels) < 0.7 * coloured(shown.pixels)
+    assert coloured(Panel(still._repr_html_()).pixels) < 0.7 * coloured(view.pixels)
 
 
 def test_of_many_views_some_are_drawn():
@@ -139,10 +139,10 @@ def test_names_cannot_break_the_page():
 
 def test_a_volume_shows_its_slices(ball: Field, box: Box):
     grid = Grid.of_resolution(box, 24)
-    shown = Panel(Volume(ball.sample(grid), grid, attributes={"n_ambient": 1.00027})._repr_html_())
-    assert "24 × 20 × 16 (x, y, z)" in shown.cells
-    assert "× 10⁻⁴" in shown.cells[shown.cells.index("Index excess") + 1]
-    assert coloured(shown.pixels) > 0.1
+    view = Panel(Volume(ball.sample(grid), grid, attributes={"n_ambient": 1.00027})._repr_html_())
+    assert "24 × 20 × 16 (x, y, z)" in view.cells
+    assert "× 10⁻⁴" in view.cells[view.cells.index("Index excess") + 1]
+    assert coloured(view.pixels) > 0.1
     masked = torch.full(grid.shape, torch.nan)
     masked[2:] = 300.0
     cells = Panel(Volume(masked, grid, "temperature", "K")._repr_html_()).cells
@@ -152,10 +152,10 @@ def test_a_volume_shows_its_slices(ball: Field, box: Box):
 def test_a_reconstruction_shows_its_field_and_why_it_stopped(measurement: Measurement):
     settings: dict[str, Any] = {"voxels": 10, "regularisation": 0.01}
     result = Tikhonov(**settings)(measurement)
-    shown = Panel(result._repr_html_())
-    assert shown.cells[shown.cells.index("Why it ended") + 1] == result.outcome.sentence
-    misfit = shown.cells[shown.cells.index("Misfit") + 1]
+    view = Panel(result._repr_html_())
+    assert view.cells[view.cells.index("Why it ended") + 1] == result.outcome.sentence
+    misfit = view.cells[view.cells.index("Misfit") + 1]
     assert float(misfit.split()[0]) == pytest.approx(result.history[-1]["residual_over_sigma"], rel=0.01)
     assert "times the noise" in misfit
-    assert " s on cpu" in shown.cells[shown.cells.index("Time") + 1]
-    assert coloured(shown.pixels) > 0.1
+    assert " s on cpu" in view.cells[view.cells.index("Time") + 1]
+    assert coloured(view.pixels) > 0.1

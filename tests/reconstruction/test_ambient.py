@@ -99,8 +99,8 @@ def test_frames_are_compared_with_truths_over_another_ambient(measurement, tmp_p
 def test_a_phantom_from_a_file_has_its_ambient(truth, cameras, tmp_path, n_ambient):
     """Over the ambient of the settings, or else that of the file."""
     path: Path = tmp_path / "own.nc"
-    own = over_vacuum(truth) if n_ambient else truth
-    write_netcdf(path, [own])
+    reference = over_vacuum(truth) if n_ambient else truth
+    write_netcdf(path, [reference])
     quick = Simulation(phantom=str(path), n_ambient=n_ambient, steps=12, truth_voxels=16)
     measurement, made = quick(cameras[:2])
     field = VoxelField.through(truth.values, truth.grid)
@@ -109,6 +109,6 @@ def test_a_phantom_from_a_file_has_its_ambient(truth, cameras, tmp_path, n_ambie
     error = (measurement.displacement - expected.displacement).norm() / expected.displacement.norm()
     assert float(error) < 1e-3
     assert float((made.values - field.sample(made.grid)).abs().max()) < 1e-3 * float(truth.values.abs().max())
-    write_netcdf(path, [replace(own, attributes={})])
+    write_netcdf(path, [replace(reference, attributes={})])
     with pytest.raises(InputError, match=r"own\.nc: expected the attribute n_ambient"):
         quick(cameras[:2])

@@ -204,8 +204,8 @@ def test_lenses_on_the_command_line(wide, tmp_path, capsys):
     assert main(["reconstruct", str(path), "-o", str(out), "--aperture", "off", *quick]) == 0
     assert main(["evaluate", str(out), "--measurement", str(path)]) == 0
     field, _, _ = ResultDirectory(out).field()
-    seen = {name: reproject(field, apply_aperture(wide, name)) for name in ("auto", "off")}
-    scores = {name: evaluate_views(reprojection)[0]["rms"] for name, reprojection in seen.items()}
+    predictions = {name: reproject(field, apply_aperture(wide, name)) for name in ("auto", "off")}
+    scores = {name: evaluate_views(reprojection)[0]["rms"] for name, reprojection in predictions.items()}
     assert ResultDirectory(out).metrics().views[0]["rms"] == pytest.approx(scores["off"], rel=1e-4)
     assert scores["auto"] != pytest.approx(scores["off"], rel=1e-3)
     assert main(["project", str(out), "-o", str(tmp_path / "p.nc"), "--cameras", str(path), "--f-number", "8"]) == 2
@@ -218,9 +218,9 @@ def test_lenses_on_the_command_line(wide, tmp_path, capsys):
     apply_aperture(wide, "off").write(tmp_path / "thin.nc")
     capsys.readouterr()
     assert main(["reconstruct", str(tmp_path / "thin.nc"), "-o", str(tmp_path / "t"), "--aperture", "on", *quick]) == 2
-    told = capsys.readouterr().err
-    assert "expected a measurement with aperture_diameter" in told
-    assert len(told.splitlines()) == 1
+    message = capsys.readouterr().err
+    assert "expected a measurement with aperture_diameter" in message
+    assert len(message.splitlines()) == 1
     assert not (tmp_path / "t").exists()
 
 

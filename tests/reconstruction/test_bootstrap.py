@@ -109,8 +109,8 @@ def test_trials_of_a_refined_rig_have_calibrated_cameras_and_are_seen_by_their_o
     member = Trials("fast").member(1, original)
     assert member.measurement.cameras == measurement.cameras
     deviations = BootstrapDeviations(member.truth, GasSettings(), original)
-    for own in (rig.draw(seeded(1)), table):  # the right rig, and that of the reconstruction
-        deviations.add_trial(member, replace(trial_of(member.truth, 0.0), rig=own))
+    for table_of in (rig.draw(seeded(1)), table):  # the right rig, and that of the reconstruction
+        deviations.add_trial(member, replace(trial_of(member.truth, 0.0), rig=table_of))
     right, wrong = deviations.residual_ratios
     assert right == pytest.approx(1.0, rel=0.02)
     assert wrong > 1.2
@@ -122,8 +122,8 @@ def test_rigs_are_drawn_with_their_covariance(measurement):
     root = torch.randn(len(rig.names), len(rig.names), generator=seeded(0), dtype=torch.float64)
     posterior, generator = RigPosterior(rig.table(), rig, root @ root.T), seeded(1)
     draws = [[row["values"]["background"] for row in posterior.draw(generator)] for _ in range(2000)]
-    drawn = torch.tensor(draws).T / rig.sigma[:, rig.columns].float()
-    assert float((torch.cov(drawn) - root @ root.T).norm() / (root @ root.T).norm()) < 0.1
+    scaled = torch.tensor(draws).T / rig.sigma[:, rig.columns].float()
+    assert float((torch.cov(scaled) - root @ root.T).norm() / (root @ root.T).norm()) < 0.1
 
 
 @pytest.mark.parametrize("share", [1.02, 0.98, 0.9])

@@ -33,7 +33,7 @@ GRID = Grid.of_resolution(BOX, 40)
 SETTINGS = NeRIF(device="cpu")
 
 
-def seen(field, views=7, pixels=36, noise=0.05, f_number=0.0, seed=1):
+def simulated(field, views=7, pixels=36, noise=0.05, f_number=0.0, seed=1):
     """What a ring of cameras sees of a field."""
     arc = (0.0, 180.0 * (1 - 1 / views))
     ring = Ring(views=views, arc=arc, image_size=(pixels, pixels), pixel_pitch=4.0 / pixels)
@@ -56,7 +56,7 @@ def smoothed(truth, mm):
 def plume():
     """A turbulent plume, with detail down to two pixels of its views, and these."""
     truth = TurbulentPlume(BOX, seed=7, shortest=0.07)
-    return truth, seen(truth)
+    return truth, simulated(truth)
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +73,7 @@ def test_voxels_are_smaller_than_pixels(plume):
     pixels = [camera.pixel_size(torch.zeros(3, dtype=torch.float64)) for camera in measurement.cameras]
     edge = max(BOX.edges) / voxels_of(measurement)
     assert 0.6 < edge / float(min(pixels)) < 0.8
-    assert voxels_of(seen(plume[0], views=2, pixels=300)) == 160
+    assert voxels_of(simulated(plume[0], views=2, pixels=300)) == 160
 
 
 def test_detail_reduces_residual_and_error_of_a_flow(plume, posterior):
@@ -125,16 +125,16 @@ def test_the_error_stated_is_not_the_one_that_chooses(plume, monkeypatch):
 
 def test_only_noise_is_not_significant():
     truth = smoothed(make_phantom("gaussians", BOX, 2), 3.0)
-    assert Detail(truth, seen(truth), SETTINGS).residual < SIGNIFICANT
+    assert Detail(truth, simulated(truth), SETTINGS).residual < SIGNIFICANT
 
 
 @pytest.mark.parametrize("seed", [3, pytest.param(4, marks=pytest.mark.slow)])
 def test_errors_are_drawn_as_large_as_they_are(posterior, plume, seed):
     truth = plume[0]
-    drawn = torch.stack([posterior.error(seed + 10 * i).sample(GRID) for i in range(2)])
+    samples = torch.stack([posterior.error(seed + 10 * i).sample(GRID) for i in range(2)])
     actual = posterior.field.sample(GRID) - truth.sample(GRID)
     flow = truth.sample(GRID).abs() > 0.02 * truth.sample(GRID).abs().max()
-    ratio = float(drawn[:, flow].square().mean().sqrt() / actual[flow].square().mean().sqrt())
+    ratio = float(samples[:, flow].square().mean().sqrt() / actual[flow].square().mean().sqrt())
     assert 0.6 < ratio < 1.6
 
 
@@ -158,7 +158,7 @@ def test_a_solution_is_stopped(plume):
 @pytest.mark.slow
 def test_a_flow_through_lenses():
     truth = TurbulentPlume(BOX, seed=9, shortest=0.07)
-    measurement = seen(truth, views=5, pixels=24, f_number=8.0)
+    measurement = simulated(truth, views=5, pixels=24, f_number=8.0)
     base = smoothed(truth, 1.5)
     detail = Detail(base, measurement, SETTINGS)
     posterior = detail.solve(detail.first(False), iterations=12)
@@ -216,7 +216,7 @@ def test_absorption(box):
 def test_rays_that_bend():
     balls = make_phantom("gaussians", BOX, 1)
     truth = VoxelField.through(60 * balls.sample(GRID), GRID)  # strong, as a flow in water
-    measurement = seen(truth, views=4, pixels=36, noise=0.01)
+    measurement = simulated(truth, views=4, pixels=36, noise=0.01)
     residual = {m: Detail(truth, measurement, replace(SETTINGS, model=m)).residual for m in ("auto", "curved")}
     assert residual["curved"] < 0.8 * residual["auto"]
 

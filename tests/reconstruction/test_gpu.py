@@ -59,13 +59,13 @@ class PretendedGPU(TorchFunctionMode):
         if to_gpu and name in ("tensor", "new_tensor"):
             self.waits.append(name)
         args, kwargs = tree_map(lambda x: CPU if isinstance(x, torch.device) else x, (args, kwargs))
-        found = func(*args, **kwargs)
+        output = func(*args, **kwargs)
         if name == "__set__" and func == Tensor.data.__set__:
             args[0].__dict__["place"] = place(args[1])
-        for x in tree_leaves(found) if to_gpu else ():
+        for x in tree_leaves(output) if to_gpu else ():
             if isinstance(x, Tensor):
                 x.__dict__["place"] = GPU
-        return found
+        return output
 
     def _check(self, name: str, args: Any, tensors: list[Tensor], there: bool) -> None:
         if name in ("einsum", "bmm") and torch.get_float32_matmul_precision() != "highest":
@@ -80,9 +80,9 @@ class PretendedGPU(TorchFunctionMode):
         elif there and name not in ("copy_", "__set__") and any(place(x) == CPU and x.ndim for x in tensors):
             raise RuntimeError(f"{name}: expected all tensors on one device")
 
-    def _moved(self, x: Tensor, asked: Any, kwargs: dict[str, Any]) -> Tensor:
+    def _moved(self, x: Tensor, wanted_device: Any, kwargs: dict[str, Any]) -> Tensor:
         target, dtype = place(x), x.dtype
-        for a in tree_leaves((asked, kwargs.get("device"), kwargs.get("dtype"), kwargs.get("other"))):
+        for a in tree_leaves((wanted_device, kwargs.get("device"), kwargs.get("dtype"), kwargs.get("other"))):
             if isinstance(a, Tensor):
                 target, dtype = place(a), a.dtype
             elif isinstance(a, torch.dtype):
@@ -110,8 +110,8 @@ def gpu(monkeypatch, unchecked) -> PretendedGPU:
 def test_projections_are_on_the_device_of_the_rays(measurement, ball, gpu):
     rays, _, _ = measurement.rays()
     with gpu:
-        seen = project(PathIntegral(LeverArm(1.0003), 4), ball, rays[:9].to(GPU), GPU)
-    assert place(seen) == GPU
+        projected = project(PathIntegral(LeverArm(1.0003), 4), ball, rays[:9].to(GPU), GPU)
+    assert place(projected) == GPU
 
 
 SHAPE = NetworkShape(depth=2, width=8, octaves=2, skip=1, head_width=4, gradient_head=True)
@@ -141,9 +141,9 @@ LONG = ("refined", "voxels")
     ],
 )
 def test_no_run_mixes_devices_or_rounds_outside_the_network(measurement, gpu, name, lens):
-    seen = replace(measurement, cameras=tuple(replace(c, lens=lens) for c in measurement.cameras))
+    projected = replace(measurement, cameras=tuple(replace(c, lens=lens) for c in measurement.cameras))
     with gpu:
-        result = RUNS[name](seen)
+        result = RUNS[name](projected)
     assert not result.outcome.failed
     assert result.device == str(GPU)
     assert not gpu.rounded
@@ -174,9 +174,9 @@ def test_a_run_from_images(measurement, gpu):
     draw = torch.Generator().manual_seed(0)
     reference = 100 + 30 * torch.randn(measurement.shape, generator=draw)
     flow = 1.1 * reference + torch.randn(measurement.shape, generator=draw)
-    taken = replace(measurement, maps={"reference": reference, "flow": flow}, displacement=None, sigma=None)
+    images = replace(measurement, maps={"reference": reference, "flow": flow}, displacement=None, sigma=None)
     with gpu:
-        assert not RUNS["fast"](taken).outcome.failed
+        assert not RUNS["fast"](images).outcome.failed
     assert not gpu.rounded
 
 

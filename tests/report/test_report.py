@@ -93,8 +93,8 @@ def test_standard_deviations_are_masked_as_in_the_file(tmp_path):
     volumes = derived(excess, "density") | {"density_std": std}
     volumes["index_excess_std"] = Volume(torch.full(excess.grid.shape, 1e-6), excess.grid, "index_excess_std")
     scene, arrays = scene_of(Result(tmp_path, volumes=volumes))
-    shown = unpack({**scene["arrays"]["density_std"], "text": arrays["density_std"]}, excess.grid.shape)
-    np.testing.assert_array_equal(np.isnan(shown), np.isnan(std.values.numpy()))
+    unpacked = unpack({**scene["arrays"]["density_std"], "text": arrays["density_std"]}, excess.grid.shape)
+    np.testing.assert_array_equal(np.isnan(unpacked), np.isnan(std.values.numpy()))
 
 
 def test_a_volume_of_128_stays_below_15_megabytes(tmp_path):
@@ -186,8 +186,8 @@ def test_refusals(tmp_path, capsys, whole):
     assert foreign.read_text().startswith("<!")
 
 
-def worst(found: list[Statement]) -> str:
-    return max((s.level for s in found), key=LEVELS.index)
+def worst(sentences: list[Statement]) -> str:
+    return max((s.level for s in sentences), key=LEVELS.index)
 
 
 def view(withheld: bool, cc: float, noise: float | None, **more) -> dict:
@@ -204,8 +204,8 @@ FIT, GOOD = view(False, 0.99, 1.0), view(True, 0.99, 1.0)
 
 
 def test_residuals_without_a_correlated_part_are_no_statement(tmp_path):
-    found = statements(Result(tmp_path, metrics=Metrics(views=[UNCORRELATED, FIT, GOOD])))
-    assert not any("correlated" in s.text for s in found)
+    sentences = statements(Result(tmp_path, metrics=Metrics(views=[UNCORRELATED, FIT, GOOD])))
+    assert not any("correlated" in s.text for s in sentences)
 
 
 @pytest.mark.parametrize(
@@ -233,9 +233,9 @@ def test_residuals_without_a_correlated_part_are_no_statement(tmp_path):
     ],
 )
 def test_statements_on_views(tmp_path, views, level, phrase):
-    found = statements(Result(tmp_path, metrics=Metrics(views=views or [])))
-    assert worst(found) == level
-    assert any(s.level == level and phrase in s.text for s in found)
+    sentences = statements(Result(tmp_path, metrics=Metrics(views=views or [])))
+    assert worst(sentences) == level
+    assert any(s.level == level and phrase in s.text for s in sentences)
 
 
 @pytest.mark.parametrize(
@@ -248,15 +248,15 @@ def test_statements_on_views(tmp_path, views, level, phrase):
 )
 def test_statements_advise_no_option_that_is_in_use(tmp_path, views, setting, option):
     for settings, advised in (({}, True), (setting, False)):
-        found = statements(Result(tmp_path, settings=settings, metrics=Metrics(views=views)))
-        assert any(option in s.text for s in found) == advised
+        sentences = statements(Result(tmp_path, settings=settings, metrics=Metrics(views=views)))
+        assert any(option in s.text for s in sentences) == advised
 
 
 @pytest.mark.parametrize(("outcome", "advised"), [("time_limit", True), ("converged", False)])
 def test_a_longer_run_is_advised_only_to_one_that_a_limit_ended(tmp_path, outcome, advised):
     views = [view(False, 0.99, 2.0), view(True, 0.5, 3.0)]
-    found = statements(Result(tmp_path, metrics=Metrics(views=views, outcome=outcome)))
-    assert sum("a longer --time-limit" in s.text for s in found) == 3 * advised  # withheld view, residuals, limit
+    sentences = statements(Result(tmp_path, metrics=Metrics(views=views, outcome=outcome)))
+    assert sum("a longer --time-limit" in s.text for s in sentences) == 3 * advised  # withheld view, residuals, limit
 
 
 @pytest.mark.parametrize(
@@ -271,9 +271,9 @@ def test_a_longer_run_is_advised_only_to_one_that_a_limit_ended(tmp_path, outcom
     ],
 )
 def test_statements_on_the_run(tmp_path, metrics, level, phrase):
-    found = statements(Result(tmp_path, metrics=Metrics(views=[FIT, GOOD], **metrics)))
-    assert worst(found) == level
-    assert any(s.level == level and phrase in s.text for s in found)
+    sentences = statements(Result(tmp_path, metrics=Metrics(views=[FIT, GOOD], **metrics)))
+    assert worst(sentences) == level
+    assert any(s.level == level and phrase in s.text for s in sentences)
 
 
 def test_the_report_gives_the_axis_and_the_correlation_of_the_halves(tmp_path):
@@ -331,8 +331,8 @@ def test_masked_voxels_are_reported(tmp_path):
     volume = smooth((6, 5, 4))
     volume.values[:3] = -3e-4
     density = derive(volume, "density", GasSettings(uniform_pressure="yes"))
-    found = statements(Result(tmp_path, volumes={"density": density}))
-    assert any("60 voxels (50.00%)" in s.text and s.level == "warning" for s in found)
+    sentences = statements(Result(tmp_path, volumes={"density": density}))
+    assert any("60 voxels (50.00%)" in s.text and s.level == "warning" for s in sentences)
 
 
 @pytest.fixture

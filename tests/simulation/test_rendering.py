@@ -1,4 +1,4 @@
-"""Rendered images obey the conventions: what is seen at p with flow is seen at p - d(p) without."""
+"""Rendered images obey the conventions: what appears at p with flow appears at p - d(p) without."""
 
 from __future__ import annotations
 

@@ -66,7 +66,7 @@ def test_particles_move_with_the_ring_and_back():
 
 
 def shifted(shift: tuple[float, float, float]) -> tuple[Volume, Volume]:
-    """A volume of particles, and the same moved by so many voxels along x, y, z."""
+    """A volume of particles, and the same moved by a number of voxels along x, y, z."""
     cloud = Particles.draw(Box.cube(8.0), 20_000, seed=2)
     moved = Particles(cloud.positions + 0.1 * torch.tensor(shift), cloud.brightness, cloud.box)
     return cloud.volume(GRID), moved.volume(GRID)

@@ -28,7 +28,7 @@ def clock(monkeypatch) -> SimpleNamespace:
     return now
 
 
-def test_fits_share_what_is_left_after_the_reserve(clock):
+def test_fits_share_the_time_beyond_the_reserve(clock):
     limit = Budget(60.0, 1000.0, 10.0)
     clock.seconds = 1005.0
     assert limit.allot(Tikhonov(time_limit=60.0), 1 / 3).time_limit == pytest.approx(45 / 3)

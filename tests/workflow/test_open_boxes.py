@@ -69,6 +69,6 @@ def test_the_result_is_that_of_the_box(cut, method, tmp_path):
     assert [view["rms"] for view in after] == pytest.approx([view["rms"] for view in before], rel=0.02)
     error = {}
     for name, run in (("grown", QUIET), ("left out", replace(QUIET, extend_open_faces=0.0))):
-        found = reconstruct_into(tmp_path / name.replace(" ", "-"), tmp_path / "m.nc", method, run).field(points)
-        error[name] = float((found - truth(points)).norm())
+        values = reconstruct_into(tmp_path / name.replace(" ", "-"), tmp_path / "m.nc", method, run).field(points)
+        error[name] = float((values - truth(points)).norm())
     assert error["grown"] < error["left out"]

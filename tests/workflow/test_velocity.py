@@ -78,9 +78,9 @@ def test_the_ring_is_found_to_rise_and_the_ambient_is_unknown(velocity: Path):
         assert np.isnan(data["w"].isel(time=2, z=0, y=0, x=0))
         assert np.isfinite(data["transport_residual"].values).any()
         assert data["pressure_std"].attrs["units"] == "Pa"
-        known = np.isfinite(data["w"].values)
-        assert (data["w_std"].values[known] >= 0).all()
-        assert np.isnan(data["w_std"].values[~known]).all()
+        finite = np.isfinite(data["w"].values)
+        assert (data["w_std"].values[finite] >= 0).all()
+        assert np.isnan(data["w_std"].values[~finite]).all()
         assert np.nanmax(data["w_std"].values) < 2 * RISE / 1e3
         np.testing.assert_allclose(data["density"].sel(x=0, y=0, z=-30, method="nearest"), 1.19, rtol=0.1)
     assert kind_of(velocity) is VELOCITY
@@ -310,7 +310,7 @@ def test_the_velocity_of_a_plume_by_another_solver(tmp_path: Path):
     error = size = 0.0
     for k in range(6):
         inside = (thetas[2 * k] > 0.05 * max(float(t.max()) for t in thetas)).numpy()
-        found = store.vectors(2 * k).numpy()
-        error += float(np.square((found - true[k])[:, inside]).sum())
+        estimate = store.vectors(2 * k).numpy()
+        error += float(np.square((estimate - true[k])[:, inside]).sum())
         size += float(np.square(true[k][:, inside]).sum())
     assert (error / size) ** 0.5 < 0.3

@@ -212,7 +212,7 @@ def test_workers_share_the_gpus_that_are_left_to_the_command(monkeypatch, visibl
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_an_interruption_keeps_complete_frames_and_tells_how_to_continue(film, tmp_path, number, code):
+def test_an_interruption_keeps_complete_frames_and_states_how_to_continue(film, tmp_path, number, code):
     out, scratch = tmp_path / "out.zarr", tmp_path / "scratch"
     scratch.mkdir()
     slowly = command(film, out, "--max-steps", "200", "--warm-steps", "100")
