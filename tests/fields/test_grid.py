@@ -49,16 +49,6 @@ def test_fields_interpolate_their_values():
         assert torch.allclose(field(centres), values, atol=1e-13)
 
 
-@pytest.mark.parametrize("degree", [1, 3])
-def test_gradient_is_exact(degree):
-    field = VoxelField(Boundary(("x+",)).extend(random(*GRID.shape), (degree + 1) // 2), GRID, degree)
-    points = torch.tensor(BOX.lower) + (0.03 + 0.94 * random(60, 3, seed=3)) * torch.tensor(BOX.edges)
-    points.requires_grad_(True)
-    value, gradient = field.value_and_gradient(points)
-    (expected,) = torch.autograd.grad(value.sum(), points)
-    assert torch.allclose(gradient, expected, atol=1e-12)
-
-
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("degree", [1, 3])
 def test_the_compiled_kernel_equals_its_readable_twin(degree, dtype, monkeypatch):

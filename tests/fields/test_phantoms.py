@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from nerif.fields.jets import AXISYMMETRIC
 from nerif.fields.phantoms import FLAME_INTERVAL, Flame, GaussianBalls, Octahedron, make_phantom
 from nerif.fields.turbulence import LONGEST, Fire, TurbulentPlume, inertial_scalar
 from nerif.fields.voxel_field import VoxelField
@@ -18,24 +17,6 @@ from refusals import refused
 CUBE = Box.cube(50.0)
 SLAB = Box((-20.0, -25.0, -15.0), (24.0, 21.0, 33.0))
 PLUME, FIRE = TurbulentPlume(SLAB, 2, shortest=0.1), Fire(SLAB, 2, shortest=0.1)
-
-
-@pytest.mark.parametrize(
-    "field",
-    [GaussianBalls.random(SLAB, 3), Flame(SLAB, 2e-4, 1), Octahedron(SLAB), PLUME, FIRE,
-     *(make_phantom(name, box) for name in AXISYMMETRIC for box in (SLAB, CUBE))],
-)  # fmt: skip
-def test_gradient_is_exact(field):
-    """Inside the side faces, beyond which axisymmetric phantoms are ambient."""
-    unit = torch.rand(4, 50, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1)) - 0.5
-    box = getattr(field, "box", SLAB)
-    points = torch.tensor(box.centre, dtype=torch.float64) + 0.75 * unit * torch.tensor(box.edges, dtype=torch.float64)
-    points.requires_grad_()
-    value, gradient = field.value_and_gradient(points)
-    (expected,) = torch.autograd.grad(value.sum(), points)
-    assert value.shape == (4, 50)
-    assert float(expected.abs().max()) > 0
-    assert float((gradient - expected).detach().abs().max()) < 1e-12 * float(expected.abs().max())
 
 
 def test_voxel_fields_are_of_fourth_order():

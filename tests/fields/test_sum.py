@@ -15,8 +15,6 @@ from nerif.fields.voxel_field import VoxelField
 from nerif.forward.path_integral import PathIntegral, project
 from nerif.forward.registry import forward_models
 from nerif.geometry import Box, Grid
-from nerif.reconstruction.field_files import read_field, write_field
-from nerif.reconstruction.reconstructor import Outcome, Reconstruction
 
 BOX = Box((-12.0, -10.0, -8.0), (12.0, 10.0, 8.0))
 
@@ -37,17 +35,6 @@ def test_values_and_gradients_add_up(both):
     torch.testing.assert_close(value, both[0](points) + both[1](points))
     torch.testing.assert_close(gradient, both[0].gradient(points) + both[1].gradient(points))
     torch.testing.assert_close(total(points), value)
-
-
-@pytest.mark.parametrize("order", [1, -1])
-def test_the_file_holds_all_parts(both, order, tmp_path):
-    total = SumField(*both[::order])
-    write_field(tmp_path, Reconstruction(total, BOX, 1.00027, [], Outcome("converged", ""), {}))
-    again, box, n_ambient = read_field(tmp_path)
-    points = torch.rand(30, 3) * 16 - 8
-    assert torch.equal(again(points), total(points))
-    assert (box, n_ambient) == (BOX, 1.00027)
-    assert [type(part) for part in again.parts] == [type(part) for part in total.parts]
 
 
 @pytest.mark.parametrize("model", ["lever_arm", "curved"])

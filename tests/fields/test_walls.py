@@ -9,17 +9,11 @@ import torch
 
 from bodies import ball, cuboid
 from nerif.fields.field import Field
-from nerif.fields.network import NeuralField
-from nerif.fields.network_kinds import network_in
 from nerif.fields.network_shape import NetworkShape
-from nerif.fields.walls import WallNetwork
 from nerif.geometry import Box, Grid, Ring
 from nerif.geometry.body import contained, from_surface
 from nerif.imaging.bodies import with_bodies
-from nerif.reconstruction.field_files import read_field, write_field
-from nerif.reconstruction.neural.fused import value_and_gradient
 from nerif.reconstruction.neural.presets import preset
-from nerif.reconstruction.reconstructor import Outcome, Reconstruction
 from nerif.simulation.simulate import simulate
 
 BOX = Box.cube(40.0)
@@ -68,42 +62,6 @@ def test_the_nearest_of_several_bodies_counts():
     points = torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, 5.0]])
     v, _ = from_surface([PLATE, other], points, 4.0)
     assert float(v[0, 2]) > 0 > float(v[1, 2])
-
-
-def test_the_gradient_of_the_network_is_that_of_its_value():
-    torch.manual_seed(0)
-    network = network_in(BOX, SHAPE, bodies=[PLATE]).double()
-    assert isinstance(network, WallNetwork)
-    field = NeuralField(network, BOX, 1.0)
-    points = points_near(500)
-    with torch.no_grad():
-        _, gradient = field.value_and_gradient(points)
-        for axis in range(3):
-            shift = torch.zeros(3, dtype=torch.float64)
-            shift[axis] = 1e-5
-            slope = (field.value(points + shift) - field.value(points - shift)) / 2e-5
-            error = (slope - gradient[:, axis]).abs()
-            assert float((error > 1e-4 * float(gradient.abs().max())).double().mean()) < 0.01
-
-
-def test_the_compiled_layers_agree_with_the_plain_ones():
-    torch.manual_seed(0)
-    network = network_in(BOX, SHAPE, bodies=[PLATE])
-    p = (points_near(300) / 20.0).float()
-    value, gradient, _ = network.value_and_gradient(p)
-    other, slope = value_and_gradient(network, p)
-    torch.testing.assert_close(value, other, atol=1e-5, rtol=1e-4)
-    torch.testing.assert_close(gradient, slope, atol=1e-4, rtol=1e-3)
-
-
-def test_a_field_with_walls_is_written_and_read(tmp_path):
-    torch.manual_seed(0)
-    field = NeuralField(network_in(BOX, SHAPE, bodies=[PLATE]), BOX, 1e-5, 0.1)
-    result = Reconstruction(field, BOX, 1.00027, [], Outcome("converged", ""), {}, bodies=(PLATE,))
-    write_field(tmp_path, result)
-    read, _, _ = read_field(tmp_path)
-    points = points_near(200).float()
-    torch.testing.assert_close(read(points), field(points).detach())
 
 
 class Sides(Field):

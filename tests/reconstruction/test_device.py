@@ -30,6 +30,7 @@ from nerif.reconstruction.device import (
     peak_memory,
     resolve_device,
 )  # fmt: skip
+from nerif.reconstruction.neural import fused
 from nerif.reconstruction.neural.losses import MixedPrecision
 from nerif.reconstruction.neural.presets import PRESETS, preset
 from nerif.simulation.simulate import view_displacement
@@ -93,6 +94,20 @@ def test_bf16_on_a_cpu_only_if_the_hardware_has_it(monkeypatch, available):
     assert (autocast_dtype("auto", CPU) is torch.bfloat16) is available
     assert autocast_dtype("bf16", CPU) is torch.bfloat16
     assert autocast_dtype("float32", CPU) is None
+
+
+@pytest.mark.parametrize(
+    ("shape", "precision", "compile", "expected"),
+    [({}, "float32", "auto", True), ({}, "float32", "off", False), ({"activation": "tanh"}, "float32", "auto", False),
+     ({"head_width": 4}, "float32", "auto", False), ({"skip": 2}, "float32", "auto", False),
+     ({}, "bf16", "auto", False)],
+)  # fmt: skip
+def test_networks_with_fused_layers(shape, precision, compile, expected):
+    mixed, calls = MixedPrecision(Network(NetworkShape(width=8, **shape)), CPU, precision, compile), []
+    if mixed.fused is not None:
+        mixed.fused = lambda *args: calls.append(args) or fused.value_and_gradient(*args)
+    mixed.value_and_gradient(torch.rand(5, 3), False)
+    assert bool(calls) == expected
 
 
 def test_peak_memory_is_that_of_this_process():
