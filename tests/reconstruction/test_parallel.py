@@ -92,7 +92,8 @@ def test_a_process_without_a_ray_of_a_technique_has_the_same_terms_with_weight_0
         sum(terms.values()).backward()
         names = {name for name, p in field.network.named_parameters() if p.grad is not None}
         share = batch.own_numbers / batch.numbers
-        assert share or float(objective.ambient_term(batch)) == 0
+        parts, numbers = [p.part for p in batch.pieces], [p.numbers for p in batch.pieces]
+        assert share or float(objective.ambient_term(parts, numbers)) == 0
         return {name: share * float(term.detach()) for name, term in terms.items()}, names, share
 
     alone, names, _ = of(Ranks())

@@ -102,13 +102,9 @@ class Network(nn.Module):
     Octave k of the encoding is weighted 2^(-k octave_decay), and from the sixth on (k > 4) 4^(4 - k) as well: its slope
     grows like 2^k, and is noise until the lower octaves represent the field.
 
-    With bounds a <= N <= b the n head is not the last layer's output v but
+    With `bounds` a <= N <= b the n head is not the last layer's output v but
 
         N = a + (softplus(k (v - a)) - softplus(k (v - b))) / k,     N = v far from both
-
-    Parameters
-    ----------
-    bounds : lowest and highest value of the n head
     """
 
     layered: ClassVar[bool] = True

@@ -23,12 +23,7 @@ __all__ = ["SymmetricNetwork", "SymmetricVoxels", "symmetry_of_field"]
 
 
 class SymmetricNetwork(Network):
-    """A network of (r, h): v(x) = sum_k D_k(x) f_k(r, h), with one output for each f_k.
-
-    Parameters
-    ----------
-    symmetry : in network coordinates
-    """
+    """A network of (r, h) for a symmetry in its coordinates: v(x) = sum_k D_k(x) f_k(r, h), an output for each f_k."""
 
     def __init__(self, shape: NetworkShape, symmetry: Symmetry, bounds: tuple[float, float] = UNBOUNDED) -> None:
         super().__init__(shape, bounds=bounds)
@@ -98,11 +93,9 @@ class SymmetricVoxels(Field):
     def through(
         cls, field: Field, symmetry: Symmetry, grid: Grid, device: torch.device | str = "cpu"
     ) -> SymmetricVoxels:
-        """Return the splines through the values of a symmetric field on a grid.
+        """Return the splines through a symmetric field on a grid (r, -, h), of two voxels across.
 
-        Parameters
-        ----------
-        grid : of (r, -, h), with two voxels across; about an axis r from -r_max to r_max
+        About an axis r runs from -r_max to r_max.
         """
         h, r = torch.meshgrid(grid.axis("z"), grid.axis("x"), indexing="ij")
         field, parts = field.to(device), []

@@ -26,12 +26,7 @@ REACH = 0.2  # L, of half the longest edge of the box
 
 
 class WallNetwork(Network):
-    """A network with the direction from the nearest surface, beside the encoding.
-
-    Parameters
-    ----------
-    bodies : in network coordinates
-    """
+    """A network with the direction from the nearest surface of bodies in its coordinates, beside the encoding."""
 
     beside: ClassVar[int] = 3
     compilable: ClassVar[bool] = False

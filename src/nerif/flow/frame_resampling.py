@@ -76,23 +76,13 @@ def _gaussian(n: int, m: int, deviation: float) -> Float[Tensor, "m n"]:
 
 
 def squared_slope(values: Float[Tensor, "t z y x"], spacing: Sequence[float]) -> Float[Tensor, "t z y x"]:
-    """Return the square of the gradient's length by central differences.
-
-    Parameters
-    ----------
-    spacing : along z, y, x
-    """
+    """Return the square of the gradient's length by central differences of a spacing along z, y, x."""
     axes = [axis for axis in (1, 2, 3) if values.shape[axis] > 1]
     return torch.stack(torch.gradient(values, spacing=[spacing[a - 1] for a in axes], dim=axes)).square().sum(dim=0)
 
 
 def laplacian(values: Float[Tensor, "*c z y x"], spacing: Sequence[float]) -> Float[Tensor, "*c z y x"]:
-    """Return the Laplacian by central differences of sixth order, with values continued beyond the faces.
-
-    Parameters
-    ----------
-    spacing : along z, y, x
-    """
+    """Return the Laplacian by central differences of sixth order (spacing along z, y, x), constant beyond the faces."""
     stencil = (-490 / 180, 270 / 180, -27 / 180, 2 / 180)
     result = torch.zeros_like(values)
     for axis, h in enumerate(spacing):

@@ -94,9 +94,7 @@ class PeriodicBox:
     ) -> Complex[Tensor, "3 z y xr"]:
         """Return vectors of which the eigenfunctions of the Laplacian are multiplied by a response.
 
-        Parameters
-        ----------
-        response : of k^2 in 1/mm^2, -1 times the eigenvalues: exp(-amount k^2) for diffusion, -k^2 for the Laplacian
+        It is a function of k^2 in 1/mm^2: exp(-amount k^2) for diffusion, -k^2 for the Laplacian.
         """
         return spectrum * response(self.wave_square)
 
@@ -123,21 +121,11 @@ class PeriodicBox:
         return torch.zeros(())
 
     def white(self, shape: Sequence[int], odd: bool, generator: torch.Generator) -> Tensor:
-        """Return white noise of variance 1, with the symmetry of the flow (odd for vorticity).
-
-        Parameters
-        ----------
-        shape : (..., z, y, x), of the box or of the measurement
-        """
+        """Return white noise (..., z, y, x) of variance 1, with the symmetry of the flow (odd for vorticity)."""
         return torch.randn(*shape, generator=generator)
 
     def low_pass(self, wavelength: float) -> Float[Tensor, "z y xr"]:
-        """Return the response (1 + (k L / 2 pi)^2)^-1, scaled so that white fields keep their variance.
-
-        Parameters
-        ----------
-        wavelength : L, mm
-        """
+        """Return the response (1 + (k L / 2 pi)^2)^-1 of L in mm, scaled so that white fields keep their variance."""
         response = 1 / (1 + self.wave_square * (wavelength / (2 * math.pi)) ** 2)
         twice = torch.full_like(response, 2.0)
         twice[..., 0] = 1  # the spectrum holds half of the waves

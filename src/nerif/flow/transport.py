@@ -138,12 +138,7 @@ class Transport:
         return self._carried[1:] | self._carried[:-1]
 
     def residual(self, splines: Float[Tensor, "t 3 zp yp xp"]) -> Float[Tensor, "t z y x"]:
-        """Return the residual of every interval.
-
-        Parameters
-        ----------
-        splines : coefficients of the velocity at the instants, mm/s
-        """
+        """Return the residual of every interval for spline coefficients of the velocity at the instants, mm/s."""
         after, before, inside = self._ends(splines)
         values = fixed_splines([*self.fields[1:], *self.fields[:-1]], [*after, *before])
         residuals, count = [], len(after)

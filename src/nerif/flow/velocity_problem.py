@@ -111,9 +111,7 @@ class VelocityProblem:
     def loss(self, controls: Tensor, noise: NoiseSample | None = None) -> tuple[Tensor, float]:
         """Return the objective, and the rms of residual / sigma where much of the scalar is.
 
-        Parameters
-        ----------
-        noise : added to residual / sigma and to the controls expected a priori
+        `noise` is added to residual / sigma and to the controls expected a priori.
         """
         residual = self.residual(self.spectra(controls))
         misfit = float(residual.detach()[self.transport.core].square().mean().sqrt())

@@ -162,15 +162,11 @@ class Refinement:
             slopes = self.aside(v) * sigma[self.columns]
             size = float((shift @ torch.linalg.pinv(slopes @ slopes.T, hermitian=True) @ shift).clamp(min=0).sqrt())
             most = max((abs(float(value[i] / sigma[i])) for i in self.columns if sigma[i] > 0), default=0.0)
-            rows.append(
-                {
-                    "name": camera.name,
-                    "correction_over_sigma": max(most, size),
-                    "image_shift_px": float(shift.norm()),
-                    "values": {NAMES[i]: float(value[i]) for i in self.columns},
-                    "prior_sigma": {NAMES[i]: float(sigma[i]) for i in self.columns},
-                }
-            )
+            values, prior_sigma = ({NAMES[i]: float(x[i]) for i in self.columns} for x in (value, sigma))
+            rows.append({
+                "name": camera.name, "correction_over_sigma": max(most, size), "image_shift_px": float(shift.norm()),
+                "values": values, "prior_sigma": prior_sigma,
+            })  # fmt: skip
         return rows
 
     def aside(self, view: int) -> Float[Tensor, "2 k"]:

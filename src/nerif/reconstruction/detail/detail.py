@@ -367,11 +367,8 @@ def choose(
 ) -> DetailChoice:  # fmt: skip
     """Return which mean and prior predict the withheld views of a field best, on a coarse grid.
 
-    Every second band of their pixels chooses; the stated errors are those of the other bands.
-
-    Parameters
-    ----------
-    most : seconds that the detail may take; once it is expected to take more, no further trial is made
+    Every second band of their pixels chooses; the stated errors are those of the other bands. Once the detail is
+    expected to take more than `most` seconds, no further trial is made.
     """
     target, start = coarse.others(withheld), time.perf_counter()
     band = torch.arange(len(target)) * 2 * BANDS // max(len(target), 1)

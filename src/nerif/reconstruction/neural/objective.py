@@ -62,11 +62,8 @@ class Objective:
             terms["gauge"] = errors.square().mean()
         return terms
 
-    def ambient_term(self, batch: Batch) -> Tensor:
-        """Return the value of each data term in the ambient field."""
-        return self._ambient_term([p.part for p in batch.pieces], [p.numbers for p in batch.pieces])
-
-    def _ambient_term(self, parts: list[TechniqueData], numbers: list[int]) -> Tensor:
+    def ambient_term(self, parts: list[TechniqueData], numbers: list[int]) -> Tensor:
+        """Return the value of each data term in the ambient field, for data with numbers of values that count."""
         terms = (reduce(part.ambient_residual, self.settings.norm) for part in parts)
         total = sum(share * term for share, term in zip(shares(numbers), terms, strict=True))
         assert isinstance(total, Tensor)
@@ -76,7 +73,7 @@ class Objective:
         """Return the loss of the ambient field, near which a network starts, on AMBIENT_RAYS rays."""
         data, weights = self.data, self.settings.weights
         parts = data.batch(shuffled(0, min(AMBIENT_RAYS, len(data)), len(data), self.settings.seed))
-        term = self._ambient_term(parts, [part.measured.numel() for part in parts])
+        term = self.ambient_term(parts, [part.measured.numel() for part in parts])
         return float(term) * sum(getattr(weights, name) for name in DATA_TERMS)
 
     def gauge_errors(self, count: int, generator: torch.Generator) -> Tensor | None:

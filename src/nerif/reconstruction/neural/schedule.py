@@ -75,9 +75,7 @@ class Cycles(Resumable):
     def end(self, error: float, noise: float, step: int, label: str = "residual of withheld pixels") -> Outcome | None:
         """End a cycle at a step of the run: begin the next, or return why there is none.
 
-        Parameters
-        ----------
-        error, noise : mean square of the residual over sigma, and its part due to noise; 0 if sigma is unknown
+        `error` is the mean square of the residual over sigma, `noise` its part due to noise; 0 if sigma is unknown.
         """
         self.errors.append(error)
         before, least = min(self.errors[:-PATIENCE], default=math.inf), min(self.errors[-PATIENCE:])

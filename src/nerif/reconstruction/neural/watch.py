@@ -204,7 +204,7 @@ class Watch:
 
     def _read(self, batch: Batch, loss: Tensor, terms: dict[str, Tensor]) -> tuple[dict[str, float], float]:
         """Loss and terms, and the data term of the ambient field, averaged over all processes."""
-        ambient = self.objective.ambient_term(batch)
+        ambient = self.objective.ambient_term([p.part for p in batch.pieces], [p.numbers for p in batch.pieces])
         own_means = torch.stack([term.detach().float() for term in (*terms.values(), loss, ambient)])
         *means, empty = self.ranks.average(own_means, batch.own_numbers, batch.numbers).tolist()
         return dict(zip((*terms, "loss"), means, strict=True)), empty
