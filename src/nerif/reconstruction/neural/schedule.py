@@ -113,11 +113,11 @@ class Schedule:
     outcome : why the run is over; None before
     rate_factor : of the learning rate, below 1 after a fit to a start and after rolling back
     ray_count : rays of all batches, in bins of any size
-    bins_chosen : whether the smallest bins of pixels that the run can use are known
+    final_bins : whether the bins of pixels are the smallest of which the run can use all
     """
 
     outcome: Outcome | None = None
-    bins_chosen = False
+    final_bins = False
 
     def __init__(self, settings: TrainingSettings, rays: int, ranks: Ranks, device: torch.device) -> None:
         self.settings, self.rays, self.ranks, self.device = settings, rays, ranks, device
@@ -212,9 +212,9 @@ class Schedule:
 
         It is chosen once, when the pace is known.
         """
-        if self.bins_chosen or self.progress < PACE_FROM:
+        if self.final_bins or self.progress < PACE_FROM:
             return edge
-        self.bins_chosen, rays, remaining = True, self.rays, self.remaining
+        self.final_bins, rays, remaining = True, self.rays, self.remaining
         while edge > 1 and 4 * rays <= remaining:
             edge, rays = edge // 2, 4 * rays
         return edge

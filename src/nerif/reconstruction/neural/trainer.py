@@ -163,7 +163,7 @@ class Trainer:
             "network": {name: value.detach().clone() for name, value in self.field.network.state_dict().items()},
             "optimiser": self.optimiser.state_dict(),
             "data": self.data.state_dict(),
-            "Bins": {"edge": self.data.edge, "final": self.schedule.bins_chosen},
+            "Bins": {"edge": self.data.edge, "final": self.schedule.final_bins},
         }
         named = {f"{group}.{name}": value for group, values in groups.items() for name, value in values.items()}
         named |= self.watch.state_dict()
@@ -193,7 +193,7 @@ class Trainer:
         density = tensors.get("density")
         self.sampler.density.values = None if density is None else density.clone().to(self.device)
         self.watch.load_state_dict(state)
-        self.schedule.bins_chosen = scalars["Bins.final"]
+        self.schedule.final_bins = scalars["Bins.final"]
         self.data.load_state_dict(scalars["stage"], state.under("data."), scalars["Bins.edge"])
         self._set_data(new_stage=False)
         self.schedule.load_state_dict(scalars["schedule"])

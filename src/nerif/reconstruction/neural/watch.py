@@ -162,7 +162,7 @@ class Watch:
             self.best_weights = {name: value.detach().clone() for name, value in weights.items()}
             self.best_data = self.data.state_dict()
         self.data.fit_nuisance(self.field)
-        schedule.bins_chosen = False  # the pace is better known now
+        schedule.final_bins = False  # the pace is better known now
         return outcome
 
     def _error(self) -> float:
