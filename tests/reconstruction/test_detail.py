@@ -155,17 +155,6 @@ def test_a_solution_is_stopped(plume):
     assert (stopped.count, stopped.problem.ratio) == (1, 1.0)
 
 
-@pytest.mark.slow
-def test_a_flow_through_lenses():
-    truth = TurbulentPlume(BOX, seed=9, shortest=0.07)
-    measurement = simulated(truth, views=5, pixels=24, f_number=8.0)
-    base = smoothed(truth, 1.5)
-    detail = Detail(base, measurement, SETTINGS)
-    posterior = detail.solve(detail.first(False), iterations=12)
-    assert posterior.residual < 0.7 * detail.residual
-    assert error(posterior.field, truth) < error(base, truth)
-
-
 def test_outside_the_masks_nothing_is_added(plume):
     truth, measurement = plume
     mask = torch.zeros_like(measurement.usable)

@@ -142,14 +142,6 @@ def test_a_non_finite_loss_rolls_back_and_in_the_end_stops(measurement, monkeypa
         assert "rolled back 1 time" in result.outcome.message
 
 
-@pytest.mark.slow
-def test_a_learning_rate_far_too_high_is_lowered(measurement):
-    result = replace(SMALL, learning_rate=0.5, max_steps=80)(measurement)
-    assert any("rolled_back" in record for record in result.history)
-    assert not result.outcome.failed
-    assert result.history[-1]["loss"] < 0.5
-
-
 def test_a_collapsed_field_is_rolled_back(measurement, monkeypatch):
     """Weights set to 0 in the middle of a good run."""
     monkeypatch.setattr(watch, "SAVE_EVERY", 40)
@@ -165,24 +157,6 @@ def test_a_collapsed_field_is_rolled_back(measurement, monkeypatch):
     assert sum("rolled_back" in record for record in result.history) == 1
     assert result.history[-1]["loss"] < 0.1
     assert result.outcome.reason == "steps"
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("octaves", "width", "depth"),
-    [
-        (8, 32, 2),
-        pytest.param(0, 32, 8, marks=pytest.mark.slow),
-        pytest.param(8, 128, 8, marks=pytest.mark.slow),
-        pytest.param(5, 512, 2, marks=pytest.mark.slow),
-    ],
-)
-def test_sixty_steps_are_enough_for_every_shape(measurement, octaves, width, depth):
-    shape = NetworkShape(depth=depth, width=width, octaves=octaves)
-    settings = NeRIF(network=shape, wave_pixels=0, max_steps=60, device="cpu", precision="float32")
-    result = settings(measurement)
-    assert result.history[-1]["loss"] < 0.5 or "not explained" in result.outcome.message
-    assert not result.outcome.failed
 
 
 @pytest.mark.parametrize(

@@ -113,28 +113,6 @@ def test_draws_have_mean_and_covariance_of_the_posterior(white, prior):
     assert float(errors.mean(dim=1).square().sum()) == pytest.approx(size / count, rel=5 * math.sqrt(2 / size))
 
 
-@pytest.mark.slow
-def test_with_the_true_prior_68_and_95_per_cent_lie_within_one_and_two_deviations(problem, prior):
-    generator, ratios = torch.Generator().manual_seed(8), []
-    for _ in range(25):
-        white = WhiteProblem(problem, prior, problem.zero())
-        z = torch.randn(SHAPE, generator=generator, dtype=torch.float64)
-        noise = torch.randn(white.data.shape, generator=generator, dtype=torch.float64)
-        white.data = white.forward(z) + math.sqrt(white.variance) * noise
-        at = after(white.solve(), ITERATIONS).x
-        mean = white.field(at)
-        draws = torch.stack([after(white.draw(at, generator), ITERATIONS) for _ in range(8)])
-        deviation = (draws - mean).square().mean(dim=0).sqrt()
-        ratios.append((mean - prior(z)).abs() / deviation)
-    within = torch.stack(ratios)
-    t = torch.distributions.StudentT(8.0)  # the deviation is that of 8 draws
-    sample = t.sample((200_000,)).abs()
-    for sigmas in (1.0, 2.0):
-        expected, share = float((sample < sigmas).float().mean()), float((within < sigmas).double().mean())
-        assert share == pytest.approx(expected, abs=0.03)
-        assert expected == pytest.approx(math.erf(sigmas / math.sqrt(2)), abs=0.04)
-
-
 def test_fixed_voxels_and_bounds(measurement, problem, prior):
     free = torch.ones(SHAPE, dtype=torch.bool)
     free[:2] = False

@@ -13,12 +13,10 @@ import torch
 from nerif.common.arrays import Points
 from nerif.fields.field import Field
 from nerif.fields.phantoms import make_phantom
-from nerif.forward.emission import Emission
 from nerif.geometry import Box, Grid, Ring, paper_rig
 from nerif.geometry.symmetry import Symmetry
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.voxels.landweber import Landweber
-from nerif.reconstruction.voxels.multiplicative import MLEM
 from nerif.reconstruction.voxels.symmetry_axis import (
     axis_of,
     better_direction,
@@ -61,21 +59,6 @@ def test_one_view_is_enough(jet, method, most):
     result = replace(method, symmetry="axis")(one_view(jet))
     assert error(result, jet.box) < most
     assert result.axis.constrained == (True, False, True, False)
-
-
-@pytest.mark.slow
-def test_emission_from_one_view():
-    cameras, box = paper_rig(40)
-    cameras = [camera.without_background for camera in cameras[:1]]
-    phantom = make_phantom("gaussian-jet", box, 0)
-
-    class Light(Field):
-        def value_and_gradient(self, points: Points):
-            value, slope = phantom.value_and_gradient(points)
-            return value.abs(), slope * value.sign()[..., None]
-
-    measured = simulate(Light(), cameras, box, 1.0, 0.02, 0, techniques=(Emission,))
-    assert error(MLEM(symmetry="axis", voxels=32)(measured), box, Light()) < 0.08
 
 
 @pytest.mark.slow
