@@ -110,7 +110,7 @@ def test_the_field_is_written_as_often_as_its_duration_allows(
         looks.append((clock[0], step.step))
         clock[0] += later if looks[1:] else first
 
-    monkeypatch.setattr(status, "_look", look)
+    monkeypatch.setattr(status, "_write_snapshot", look)
     step = Step(1, 0.0, 0.0, 0.5, {"loss": 1.0}, 1.0, lambda: None, lambda: None)
     with status.watching(QUIET, withheld=False).training("training") as on_step:
         for i in range(4000):
