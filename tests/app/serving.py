@@ -15,7 +15,7 @@ import sys
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -36,12 +36,14 @@ class Served:
     port : that it listens on
     pid : number of its process
     said : its first lines
+    folder : of the project
     """
 
     link: str
     port: int
     pid: int
-    output: str
+    said: str
+    folder: Path = Path()
 
     @property
     def token(self) -> str:
@@ -69,9 +71,9 @@ def free_port() -> int:
 
 
 def outside() -> dict[str, str]:
-    """The environment without pytest's variables, with which NiceGUI behaves otherwise."""
-    environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST")}
-    return {**environment, "PYTHONUNBUFFERED": "1", "OMP_NUM_THREADS": "1"}
+    """The environment without what tells of a test: NiceGUI behaves otherwise where it is told of one."""
+    known = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST")}
+    return {**known, "PYTHONUNBUFFERED": "1", "OMP_NUM_THREADS": "1"}
 
 
 @cache
@@ -106,19 +108,19 @@ def served(folder: Path, *arguments: str, port: int | None = None, by: Sequence[
         pid, printed = forked(words, Path(place) / "out", by)
         with printed:
             try:
-                yield answering(pid, printed)
+                yield replace(answering(pid, printed), folder=folder)
             finally:
                 end(pid, printed)
 
 
 def answering(pid: int, printed: Iterable[str]) -> Served:
     """Wait until a server says that it answers."""
-    output = ""
+    said = ""
     for line in printed:
-        output += line
-        if match := re.search(r"http://[^:]+:(\d+)/\?token=\S+", line):
-            return Served(match[0], int(match[1]), pid, output)
-    raise AssertionError(f"it did not start: {output}")
+        said += line
+        if found := re.search(r"http://[^:]+:(\d+)/\?token=\S+", line):
+            return Served(found[0], int(found[1]), pid, said)
+    raise AssertionError(f"it did not start: {said}")
 
 
 def end(pid: int, printed: IO[str]) -> None:

@@ -6,23 +6,14 @@ The project holds something for each page: images, a calibration, a measurement,
 from __future__ import annotations
 
 import importlib.resources
-from pathlib import Path
 from typing import Any
 
-import imageio.v3 as iio
-import numpy as np
 import pytest
 
 from app.serving import Served, opened
-from app.test_calibration import TARGET
-from app.test_live_view import watched
-from app.test_pages import visit
-from app.test_results import result
 from nerif.app.pages import PAGES
-from nerif.app.pages.frame import Page
-from nerif.data.cameras_file import CalibratedCamera, write_cameras
-from nerif.geometry import Ring
-from nerif.simulation.simulation import Simulation
+from nerif.app.pages.page import Page
+from nerif.app.project.demo_project import MARK
 from report.browsing import errors, needs_browser, requests, wait_for
 
 pytestmark = needs_browser
@@ -51,6 +42,7 @@ return [...document.querySelectorAll('main *, header *')].filter(e => e.checkVis
   e.getBoundingClientRect().right > edge && !inside(e)).map(e => e.outerHTML.slice(0, 120)).slice(0, 4);
 """
 """Elements that reach beyond the right edge of the window: the page hides them where it does not scroll."""
+LANDMARKS = ("main h1", "nav[aria-label] a[aria-current=page]", "header", "a.skip", "html[lang^=en]")
 FOCUS = """
 const e = document.activeElement, own = getComputedStyle(e);
 const box = getComputedStyle(e.closest('.q-field__control') ?? e);
@@ -70,23 +62,7 @@ def settled(driver: Any) -> None:
                      ".iterations === Infinity)")  # fmt: skip
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    project = tmp_path_factory.mktemp("project")
-    ring = Ring(views=3, arc=(20.0, 100.0), image_size=(24, 30), pixel_pitch=0.2)
-    board = (40 + 170 * TARGET.raster(3.0)).astype(np.uint8)
-    for camera in ring.cameras():
-        for source in ("target", "background", "reference", "flow"):
-            (project / "run" / camera.name / source).mkdir(parents=True)
-            iio.imwrite(project / "run" / camera.name / source / "p.png", board)
-    write_cameras(project / "calibration.toml", [CalibratedCamera.from_camera(camera) for camera in ring.cameras()])
-    Simulation(phantom="gaussians", truth_voxels=6)(ring.cameras())[0].write(project / "m.nc")
-    result(project / "results" / "a", 12, 0.0)
-    watched(project)
-    return project
-
-
-def violations(driver: Any, server: Served, page: Page, size: tuple[int, int], dark: bool) -> list[Any]:
+def seen(driver: Any, server: Served, page: Page, size: tuple[int, int], dark: bool) -> list[Any]:
     """Open a page once all of it is there, and return the rules that it breaks."""
     scheme = [{"name": "prefers-color-scheme", "value": "dark" if dark else "light"}]
     driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": scheme})
@@ -112,10 +88,12 @@ CASES = [
 @pytest.mark.parametrize(("size", "dark"), CASES)
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_a_page_breaks_no_rule_fits_and_asks_nobody_else(browser, server, page, size, dark):
-    assert violations(browser, server, page, size, dark) == []
+    assert seen(browser, server, page, size, dark) == []
     wide = browser.execute_script("return document.documentElement.scrollWidth - document.documentElement.clientWidth")
     assert wide <= 0
     assert browser.execute_script(CUT) == []
+    counts = "return arguments[0].map(e => document.querySelectorAll(e).length)"
+    assert browser.execute_script(counts, LANDMARKS) == [1] * len(LANDMARKS)
     assert errors(browser) == []
     here = f"http://127.0.0.1:{server.port}/", f"ws://127.0.0.1:{server.port}/"
     assert [address for address in requests(browser) if not address.startswith(here)] == []
@@ -127,7 +105,7 @@ def metrics(width: int, height: int) -> dict[str, Any]:
 
 
 def test_a_broken_rule_is_found(browser, server):
-    visit(browser, server, "design")
+    opened(browser, server, "design", THERE["design"])
     browser.execute_script("document.querySelector('main').append(document.createElement('button'))")
     browser.execute_script(axe())
     assert [rule for rule, *_ in browser.execute_async_script(RULES)] == ["button-name"]
@@ -137,7 +115,7 @@ def test_a_page_is_used_without_a_mouse(browser, server):
     """The first key leads past the navigation; then controls come in their order, and are seen to have the focus."""
     from selenium.webdriver.common.keys import Keys
 
-    visit(browser, server, "design")
+    opened(browser, server, "design", THERE["design"])
     browser.find_element("tag name", "body").send_keys(Keys.TAB)
     assert browser.execute_script("return document.activeElement.className") == "skip"
     browser.switch_to.active_element.send_keys(Keys.ENTER)
@@ -153,3 +131,16 @@ def test_a_page_is_used_without_a_mouse(browser, server):
         "Focal length (mm)", "Focal length (mm), slider", "F number", "F number, slider", "Pixel pitch (mm)",
         "Pixel pitch (mm), slider",
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
+def test_a_hint_breaks_no_rule_on_a_phone(browser, server, dark):
+    """The page is that of a demo project for as long as the mark is there."""
+    (server.folder / MARK).write_text('{"complete": true}')
+    page = next(page for page in PAGES if page.name == "displacement")
+    assert seen(browser, server, page, PHONE, dark) == []
+    assert browser.execute_script("return document.querySelector('.guide')?.checkVisibility()")
+    assert browser.execute_script(CUT) == []
+    covered = browser.execute_script("return document.querySelector('nav').getBoundingClientRect().right")
+    assert covered <= 0  # the navigation does not lie over the page
+    (server.folder / MARK).unlink()

@@ -15,7 +15,8 @@ from types import SimpleNamespace
 import pytest
 from nicegui import Client, ui
 
-from app.serving import answering, end, free_port, outside, served
+from app.serving import answering, end, free_port, outside
+from app.visiting import visiting
 from nerif.app.forms.elements import card
 from nerif.app.forms.sliders import RangeSlider
 from nerif.app.pages import PAGES
@@ -118,7 +119,7 @@ def test_a_run_that_was_found_is_shown_and_starts_only_by_hand(tmp_path):
     jobs = Jobs(tmp_path)
     jobs.advance()
     assert [(job.id, job.state, job.line) for job in jobs.all()] == [("planted", "held", "nerif --version")]
-    jobs.first("planted")
+    jobs.move("planted", -1)
     jobs.advance()
     assert not (jobs.directory / "planted" / "log.txt").exists()
     jobs.stop("planted")
@@ -171,14 +172,15 @@ def test_python_m_nerif_imports_no_package_of_a_folder(tmp_path):
     assert not (tmp_path / "mark").exists()
 
 
+@pytest.mark.anyio
 @pytest.mark.parametrize("wrong", [5, [1], {"a": 1}], ids=str)
-def test_pages_open_with_the_defaults_where_drafts_have_wrong_types(tmp_path, wrong):
+async def test_pages_open_with_the_defaults_where_drafts_have_wrong_types(tmp_path, wrong):
     drafts = dict.fromkeys((page.name for page in PAGES), dict.fromkeys(("leave_out", "values", "target"), wrong))
     (tmp_path / ".nerif").mkdir()
     (tmp_path / ".nerif" / "drafts.json").write_text(json.dumps(drafts))
-    with served(tmp_path) as server:
-        cookie = {"Cookie": server.cookie()}
-        assert {page.name: server.get(page.path, cookie)[0] for page in PAGES} == dict.fromkeys(drafts, 200)
+    async with visiting(tmp_path) as user:
+        for page in PAGES:
+            await user.open(page.name, page.about)
 
 
 def test_drafts_are_dropped_once(tmp_path, monkeypatch):

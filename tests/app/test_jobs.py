@@ -17,7 +17,6 @@ from nerif.app.project.jobs import CommandRun, Jobs
 from nerif.app.views.result_volumes import film_progress
 from nerif.cli.cli import main
 from nerif.common.files import write_json
-from nerif.common.installation import command_line
 from nerif.common.locks import locked
 from refusals import refused
 
@@ -34,10 +33,11 @@ def until(jobs: Jobs, id: str, *states: str, seconds: float = 60.0) -> CommandRu
     return job
 
 
-def test_a_run_is_done_and_its_words_are_kept(tmp_path):
+def test_runs_are_done_one_at_a_time_and_their_words_are_kept(tmp_path):
     jobs = Jobs(tmp_path)
     first, second = jobs.add(HELP, "one"), jobs.add(("nonsense",), "two")
-    assert [job.state for job in jobs.all()] == ["queued", "queued"]
+    jobs.advance()
+    assert [job.state for job in jobs.all()] == ["running", "queued"]
     assert until(jobs, first.id, "done").code == 0
     assert jobs.log(first.id)[0].startswith("nerif ")
     assert until(jobs, second.id, "failed").code == 2
@@ -46,25 +46,20 @@ def test_a_run_is_done_and_its_words_are_kept(tmp_path):
     jobs.remove(first.id)
     with refused("job"):
         jobs.get(first.id)
-
-
-@pytest.mark.slow
-def test_one_at_a_time_and_in_order(tmp_path):
-    jobs = Jobs(tmp_path)
-    jobs.advance()
-    ids = [jobs.add(HELP, str(i)).id for i in range(3)]
-    jobs.first(ids[2])
-    assert [job.title for job in jobs.all()] == ["2", "0", "1"]
-    jobs.advance()
-    assert [job.state for job in jobs.all()] == ["running", "queued", "queued"]
-    jobs.at_once = 2
-    jobs.advance()
-    assert [job.state for job in jobs.all()].count("running") <= 2
-    jobs.stop(ids[1])
-    for id in ids:
-        until(jobs, id, "done", "stopped")
     with refused("at_once"):
         jobs.at_once = 0
+
+
+def test_waiting_runs_change_places(tmp_path):
+    jobs = Jobs(tmp_path)
+    ids = [jobs.add(HELP, str(i)).id for i in range(3)]
+    for moved, by, order in (
+        (2, -1, "021"), (0, 1, "201"), (2, -1, "201"), (1, 1, "201"), (1, -9, "120"), (1, 9, "201")
+    ):  # fmt: skip
+        jobs.move(ids[moved], by)
+        assert "".join(job.title for job in jobs.all()) == order
+    jobs.stop(ids[0])
+    assert [(job.title, job.state) for job in jobs.all()] == [("2", "queued"), ("1", "queued"), ("0", "stopped")]
 
 
 def sleeping(jobs: Jobs, process: subprocess.Popen[bytes], **more: object) -> str:
@@ -90,19 +85,14 @@ def process():
 def test_another_server_finds_what_runs_and_may_end_it(tmp_path, process):
     id = sleeping(Jobs(tmp_path), process)
     other = Jobs(tmp_path)
-    assert other.get(id).state == "running"
-    assert other.get(id).pid == process.pid
+    assert (other.get(id).state, other.get(id).pid) == ("running", process.pid)
+    reused = sleeping(other, process, began="1.0")  # the number of a process that was given again
+    assert other.get(reused).state == "failed"
     with refused(f"job {id}"):
         other.remove(id)
     other.stop(id)
     process.wait(10)
     assert other.get(id).state == "stopped"
-
-
-def test_a_number_of_a_process_that_was_given_again_is_no_run(tmp_path, process):
-    jobs = Jobs(tmp_path)
-    id = sleeping(jobs, process, began="1.0")
-    assert jobs.get(id).state == "failed"
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere the system keeps the time of day at the start")
@@ -192,22 +182,14 @@ def test_a_process_that_cannot_start_a_run_says_why(tmp_path, monkeypatch):
     assert jobs.log(id) == ["it is broken"]
 
 
-def test_command_lines_are_quoted():
-    assert command_line(["info", "a b; rm -rf $HOME.nc"]) == "nerif info 'a b; rm -rf $HOME.nc'"
-
-
 @pytest.mark.parametrize("text", ["{", "[" * 100_000, "[1]", '{"id": 1}', "title", "arguments", "words"])
 def test_damaged_files_are_no_runs(tmp_path, text):
     jobs = Jobs(tmp_path)
-    entries = {
-        "id": "bad",
-        "title": "",
-        "arguments": ["info"],
-        "attempt": ["info"],
-        "out": "",
-        "request": "",
-        "place": 0,
-    }
+    words = ["info", "a b; rm -rf $HOME.nc"]
+    assert jobs.get(jobs.add(words, "").id).line == "nerif info 'a b; rm -rf $HOME.nc'"
+    jobs.remove(jobs.all()[0].id)
+    entries = dict.fromkeys(("title", "out", "request"), "") | {"id": "bad", "place": 0}
+    entries |= {"arguments": words, "attempt": words}
     wrong = {"title": {"title": "\ud800"}, "arguments": {"arguments": []}, "words": {"attempt": [1]}}
     bad: Path = jobs.directory / "bad"
     bad.mkdir(parents=True)
@@ -216,28 +198,14 @@ def test_damaged_files_are_no_runs(tmp_path, text):
     assert os.listdir(bad) == ["job.json"]
 
 
-def test_waiting_runs_change_places(tmp_path):
-    jobs = Jobs(tmp_path)
-    ids = [jobs.add(HELP, str(i)).id for i in range(3)]
-    jobs.earlier(ids[2])
-    assert [job.title for job in jobs.all()] == ["0", "2", "1"]
-    jobs.later(ids[0])
-    assert [job.title for job in jobs.all()] == ["2", "0", "1"]
-    jobs.earlier(ids[2])  # the first already
-    jobs.later(ids[1])  # the last
-    assert [job.title for job in jobs.all()] == ["2", "0", "1"]
-    jobs.stop(ids[0])
-    assert [(job.title, job.state) for job in jobs.all()] == [("2", "queued"), ("1", "queued"), ("0", "stopped")]
-
-
 @pytest.mark.slow
 def test_a_film_is_paused_and_does_only_what_is_missing(tmp_path):
     small = ["--image-size", "12", "16", "--pixel-pitch", "0.3", "--views", "4", "--truth-voxels", "8"]
     assert main(["simulate", "-o", str(tmp_path / "f.zarr"), *small, "--times", "0:3e-3:4"]) == 0
     jobs, out = Jobs(tmp_path), tmp_path / "r.zarr"
     steps = ["--max-steps", "60", "--warm-steps", "20", "--chunk", "1", "--voxels", "8", "--force"]
-    line = ["sequence", "f.zarr", "--out", "r.zarr", "--workers", "1", "--threads", "1", *steps]
-    id = jobs.add(line, "film", "r.zarr").id
+    words = ["sequence", "f.zarr", "--out", "r.zarr", "--workers", "1", "--threads", "1", *steps]
+    id = jobs.add(words, "film", "r.zarr").id
     until(jobs, id, "running")
     end = time.monotonic() + 120
     while film_progress(out)[0] == 0:

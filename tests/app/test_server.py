@@ -1,8 +1,10 @@
-"""Who is let in, what leaves, and how the server begins and ends: a real one, over its port."""
+"""Who is let in, what leaves, and how the server begins and ends: a real one, asked over the wire."""
 
 from __future__ import annotations
 
 import logging
+import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -15,75 +17,57 @@ from urllib.parse import urlsplit
 
 import psutil
 import pytest
+from nerif.cli.commands.settings import read_settings
 
 from app.serving import Served, answering, free_port, outside, served
 from nerif.app.command import App
+from nerif.app.pages import PAGES
+from nerif.app.project.workspace import READ_ONLY
 from nerif.app.server.guard import cookie_of
 from nerif.app.server.private import page_leading_to
 from nerif.app.server.server import Address, is_relevant
 from nerif.cli.cli import main
-from nerif.cli.settings import read_settings
 from nerif.common.conventions import InputError
 from refusals import refused
 from report.browsing import needs_browser, wait_for
 
+BOUND = ("setpriv", "--bounding-set=-dac_override,-dac_read_search")  # root that rights of files hold for, too
 STATIC = "/_nicegui/3.18.0/static/nicegui.css"
 SOCKET = "/_nicegui_ws/socket.io/?EIO=4&transport=polling"
 
 
-@pytest.fixture(scope="module")
-def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
-    with served(tmp_path_factory.mktemp("project")) as child:
-        yield child
-
-
-@pytest.mark.parametrize("path", ["/", "/design", STATIC, SOCKET, "/design?token=wrong", "/nowhere"])
-def test_without_the_token_nothing_is_answered(server, path):
-    status, headers, text = server.get(path)
-    assert status == 403
-    assert "nicegui" not in text
-    assert "set-cookie" not in headers
+def test_without_the_token_nothing_is_answered_and_with_the_cookie_it_is(server):
+    for path in ("/", "/design", STATIC, SOCKET, "/design?token=wrong", "/nowhere"):
+        status, headers, text = server.get(path)
+        assert (status, "nicegui" in text, "set-cookie" in headers) == (403, False, False)
+    for path in ("/design", STATIC, SOCKET):
+        status, headers, _ = server.get(path, {"Cookie": server.cookie()})
+        assert (status, "default-src 'self'" in headers["content-security-policy"]) == (200, True)
 
 
 def test_the_token_is_exchanged_for_a_cookie_that_no_script_reads(server):
     status, headers, _ = server.get(f"/design?token={server.token}&x=1")
     assert (status, headers["refresh"]) == (200, "0; url=/design?x=1")
-    stored = headers["set-cookie"]
-    assert "HttpOnly" in stored
-    assert "SameSite=Strict" in stored
-    assert server.token not in stored
-    assert cookie_of(server.token) in stored
+    kept = headers["set-cookie"]
+    assert all(word in kept for word in ("HttpOnly", "SameSite=Strict", cookie_of(server.token)))
+    assert server.token not in kept
 
 
-@pytest.mark.parametrize("path", ["/design", STATIC, SOCKET])
-def test_with_the_cookie_it_is(server, path):
-    status, headers, _ = server.get(path, {"Cookie": server.cookie()})
-    assert status == 200
-    assert "default-src 'self'" in headers["content-security-policy"]
+def test_cookies_of_other_programs_lock_nobody_out(server):
+    own = server.cookie()
+    for foreign in ('prefs={"a":1}', "x[y]=1", "name=\xfc\xdf", "a", "=;;", f"nerif-{server.port}=old", own):
+        for cookies in (f"{foreign}; {own}", f"{own};{foreign}"):
+            assert server.get("/design", {"Cookie": cookies})[0] == 200
+        assert server.get("/design", {"Cookie": foreign.replace(own, "")})[0] == 403
 
 
-@pytest.mark.parametrize(
-    "foreign", ['prefs={"a":1}', "x[y]=1", "name=\xfc\xdf", "a", "=;;", "nerif-{port}=old", "{authorised}"]
-)
-@pytest.mark.parametrize("order", ["{foreign}; {authorised}", "{authorised};{foreign}"])
-def test_cookies_of_other_programs_lock_nobody_out(server, foreign, order):
-    authorised = server.cookie()
-    foreign = foreign.replace("{authorised}", authorised).replace("{port}", str(server.port))
-    assert server.get("/design", {"Cookie": order.format(foreign=foreign, authorised=authorised)})[0] == 200
-    assert server.get("/design", {"Cookie": foreign.replace(authorised, "")})[0] == 403
-
-
-@pytest.mark.parametrize("path", ["/design", STATIC, SOCKET])
-@pytest.mark.parametrize("host", ["evil.example", "evil.example:80", "127.0.0.1", "127.0.0.1.evil.example:1"])
-def test_a_foreign_name_that_leads_here_is_refused(server, path, host):
-    assert server.get(path, {"Host": host, "Cookie": server.cookie()})[0] == 421
-
-
-@pytest.mark.parametrize("origin", ["http://evil.example", "null", "http://127.0.0.1:1", "file://"])
-def test_a_page_of_others_is_refused(server, origin):
-    for path in ("/design", SOCKET):
-        assert server.get(path, {"Origin": origin, "Cookie": server.cookie()})[0] == 403
-        assert server.get(f"/?token={server.token}", {"Origin": origin})[0] == 403
+def test_a_foreign_name_that_leads_here_and_a_page_of_others_are_refused(server):
+    cookie = {"Cookie": server.cookie()}
+    for path in ("/design", STATIC, SOCKET, f"/?token={server.token}"):
+        for host in ("evil.example", "evil.example:80", "127.0.0.1", "127.0.0.1.evil.example:1"):
+            assert server.get(path, {"Host": host, **cookie})[0] == 421
+        for origin in ("http://evil.example", "null", "http://127.0.0.1:1", "file://"):
+            assert server.get(path, {"Origin": origin, **cookie})[0] == 403
 
 
 def upgrade(server: Served, *headers: str) -> str:
@@ -120,20 +104,18 @@ def proxied(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
 @pytest.mark.parametrize("host", [HUB, "localhost:9000", ""])
 def test_a_tunnel_and_a_proxy_that_removes_or_keeps_its_path(proxied, host, inside):
     """jupyter-server-proxy passes the browser's Host and Origin on, and states its path besides."""
-    authorised = {"Host": host or f"127.0.0.1:{proxied.port}", "X-Forwarded-Prefix": ROOT}
-    status, headers, _ = proxied.get(f"{inside}/?token={proxied.token}", authorised)
+    own = {"Host": host or f"127.0.0.1:{proxied.port}", "X-Forwarded-Prefix": ROOT}
+    status, headers, _ = proxied.get(f"{inside}/?token={proxied.token}", own)
     assert (status, headers["refresh"]) == (200, f"0; url={ROOT}/")
     assert f"Path={ROOT};" in headers["set-cookie"] + ";"
-    authorised |= {"Cookie": headers["set-cookie"].partition(";")[0], "Origin": f"https://{authorised['Host']}"}
-    status, headers, _ = proxied.get(f"{inside}/", authorised)
-    assert (status, headers["location"]) == (307, "design")
-    status, _, page = proxied.get(f"{inside}/design", authorised)
-    assert status == 200
+    own |= {"Cookie": headers["set-cookie"].partition(";")[0], "Origin": f"https://{own['Host']}"}
+    assert proxied.get(f"{inside}/", own)[1]["location"] == "design"
+    page = proxied.get(f"{inside}/design", own)[2]
     assert f'src="{ROOT}{STATIC.rpartition("/")[0]}/nicegui.js"' in page
     assert ROOT + ROOT not in page
-    assert proxied.get(inside + STATIC, authorised)[0] == proxied.get(inside + SOCKET, authorised)[0] == 200
+    assert proxied.get(inside + STATIC, own)[0] == proxied.get(inside + SOCKET, own)[0] == 200
     assert "href='results'" in page.replace("\\u003E", ">").replace("\\", "")
-    assert " 101" in upgrade(proxied, f"Cookie: {authorised['Cookie']}", f"Origin: {authorised['Origin']}")
+    assert " 101" in upgrade(proxied, f"Cookie: {own['Cookie']}", f"Origin: {own['Origin']}")
 
 
 def test_an_allowed_host_admits_no_other(proxied):
@@ -143,48 +125,42 @@ def test_an_allowed_host_admits_no_other(proxied):
         for scheme in ("http", "https"):
             assert proxied.get("/design", {"Host": HUB, "Origin": f"{scheme}://{host}", "Cookie": cookie})[0] == 403
     assert proxied.get("/design", {"Host": HUB})[0] == 403
-    assert proxied.get("/design", {"Host": HUB, "Cookie": cookie, "X-Forwarded-Prefix": "//evil"})[0] == 200
-    assert "evil" not in proxied.get("/design", {"Host": HUB, "Cookie": cookie, "X-Forwarded-Prefix": "//evil"})[2]
+    status, _, page = proxied.get("/design", {"Host": HUB, "Cookie": cookie, "X-Forwarded-Prefix": "//evil"})
+    assert (status, "evil" in page) == (200, False)
 
 
 def test_a_refused_address_names_the_option_and_the_token(server):
     text = server.get("/design", {"Host": "localhost:9000", "Cookie": server.cookie()})[2]
     assert "address of this server: localhost:9000. If that is a tunnel or proxy" in text
     assert "--allowed-host localhost:9000 (and --root-path" in text
-    authorised = {"Host": f"127.0.0.1:{server.port}", "Cookie": server.cookie()}
-    assert "--allowed-host hub.example.org " in server.get("/design", {**authorised, "Origin": "https://hub.example.org"})[2]
+    own = {"Host": f"127.0.0.1:{server.port}", "Cookie": server.cookie()}
+    assert "--allowed-host hub.example.org " in server.get("/design", {**own, "Origin": "https://hub.example.org"})[2]
     assert "/?token=..." in server.get("/design")[2]
     for strange in ("<b>x</b>", "a b", "x;rm", "h:port"):
         assert server.get("/design", {"Host": strange})[::2] == (421, "This is not an address of this server.")
 
 
-@pytest.mark.parametrize(
-    ("words", "field"),
-    [
-        ("--allowed-host https://hub.example.org", "allowed_host"), ("--allowed-host *", "allowed_host"),
-        ("--allowed-host hub.example.org/user", "allowed_host"), ("--root-path user/me", "root_path"),
-        ("--root-path //evil.example", "root_path"), ("--root-path /a?b", "root_path"),
-        ("--root-path /<b>", "root_path"),
-    ],
-)  # fmt: skip
-def test_addresses_that_are_none_are_refused(tmp_path, words, field):
-    with pytest.raises(InputError, match=f"^{field}: expected"):
-        read_settings(App(), [str(tmp_path), *words.split()], "app")
+@pytest.mark.parametrize(("option", "values"), [
+    ("allowed-host", ("https://hub.example.org", "*", "hub.example.org/user")),
+    ("root-path", ("user/me", "//evil.example", "/a?b", "/<b>")), ("token", ("short",)), ("port", ("0",)),
+])  # fmt: skip
+def test_addresses_that_are_none_are_refused(tmp_path, option, values):
+    for value in values:
+        with pytest.raises(InputError, match=f"^{option.replace('-', '_')}: expected"):
+            read_settings(App(), [str(tmp_path), f"--{option}", value], "app")
 
 
 def test_it_listens_on_this_machine_alone(server):
     with socket.socket() as probe:
-        authorised = socket.gethostbyname(socket.gethostname())
-        if authorised.startswith("127."):
+        own = socket.gethostbyname(socket.gethostname())
+        if own.startswith("127."):
             pytest.skip("this machine has no other address than its own")
-        assert probe.connect_ex((authorised, server.port)) != 0
+        assert probe.connect_ex((own, server.port)) != 0
 
 
 def test_others_are_let_in_with_a_token_only():
     with refused("host"):
         Address.of("0.0.0.0", 8000, None)
-    with refused("token"):
-        App(token="short")
     assert "[::1]" in Address("::1", 1, "x" * 16).names
 
 
@@ -194,8 +170,8 @@ def test_a_server_for_all_interfaces_answers_to_the_address_of_each(monkeypatch)
         "eth0": [(socket.AF_INET, "192.0.2.7"), (socket.AF_INET6, "fe80::1%eth0"), (-1, "02:00:5e:10:00:00")],
         "lo": [(socket.AF_INET, "127.0.0.1")],
     }  # fmt: skip
-    child = {name: [SimpleNamespace(family=f, address=a) for f, a in rows] for name, rows in there.items()}
-    monkeypatch.setattr(psutil, "net_if_addrs", lambda: child)
+    found = {name: [SimpleNamespace(family=f, address=a) for f, a in rows] for name, rows in there.items()}
+    monkeypatch.setattr(psutil, "net_if_addrs", lambda: found)
     monkeypatch.setattr(socket, "getaddrinfo", lambda *_: [(socket.AF_INET, 1, 6, "", ("127.0.1.1", 0))])
     names = Address("0.0.0.0", 1, "x" * 16).names
     assert {"192.0.2.7", "[fe80::1]", socket.gethostname()} <= set(names)
@@ -218,12 +194,9 @@ def test_a_port_that_is_taken_gives_the_next(capsys):
     assert f"port {port} is in use" in capsys.readouterr().out
 
 
-def test_a_folder_that_is_none_is_said_in_one_line(tmp_path, capsys):
+def test_without_a_folder_or_nicegui_the_remedy_is_said(tmp_path, capsys, monkeypatch):
     assert main(["app", str(tmp_path / "nowhere"), "--no-browser"]) == 2
     assert "expected a folder to work in" in capsys.readouterr().err
-
-
-def test_without_nicegui_the_remedy_is_said(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     assert main(["app", str(tmp_path)]) == 2
     assert "pip install 'nerif-bost[app]'" in capsys.readouterr().err
@@ -286,11 +259,25 @@ def test_pages_below_the_path_of_a_proxy_lead_to_one_another(browser, proxied):
     wait_for(browser, f"return location.pathname === '{ROOT}/results' && window.socket?.connected")
 
 
-@pytest.mark.parametrize(("error", "logged"), [("No response returned.", False), ("out of tune", True)])
-def test_a_browser_that_goes_on_is_no_error_and_all_else_is(error, logged):
+@pytest.mark.slow
+def test_a_folder_without_rights_is_told_in_one_line_and_can_be_read(tmp_path):
+    root = os.geteuid() == 0
+    if root and shutil.which("setpriv") is None:
+        pytest.skip("root may write everywhere, and setpriv, by which it may not, is not there")
+    tmp_path.chmod(0o555)
+    with served(tmp_path, by=BOUND if root else ()) as server:
+        assert f"note: {READ_ONLY}" in server.said
+        for page in PAGES:
+            assert READ_ONLY in server.get(page.path, {"Cookie": server.cookie()})[2]
+    tmp_path.chmod(0o755)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(("error", "shown"), [("No response returned.", False), ("out of tune", True)])
+def test_a_browser_that_goes_on_is_no_error_and_all_else_is(error, shown):
     try:
         raise RuntimeError(error)
     except RuntimeError:
         entry = logging.LogRecord("uvicorn.error", logging.ERROR, "", 0, "Exception", (), sys.exc_info())
-    assert is_relevant(entry) is logged
+    assert is_relevant(entry) is shown
     assert is_relevant(logging.LogRecord("uvicorn.error", logging.INFO, "", 0, "ready", (), None))

@@ -10,12 +10,38 @@ from typing import Any
 from nicegui import ui
 
 from nerif.common.conventions import InputError
-from nerif.common.installation import command_line, quoted
+from nerif.common.installation import quoted
 
 __all__ = [
-    "CommandLine", "FileChoice", "card", "dialog", "figures", "images_html", "items_html", "refusals", "select",
-    "table_html", "text_html", "work_in_progress",
+    "CommandLine", "FileChoice", "card", "dialog", "figures", "html", "image", "images_html", "items_html", "refusals",
+    "select", "table_html", "text_field", "text_html",
 ]  # fmt: skip
+
+DEFAULTS: dict[type[ui.element], str] = {
+    ui.button: "no-caps", ui.tabs: "no-caps", ui.toggle: "no-caps", ui.select: "outlined dense options-dense",
+    ui.input: "outlined dense debounce=250", ui.number: "outlined dense debounce=250",
+}  # fmt: skip
+for kind, properties in DEFAULTS.items():
+    kind.default_props(properties)
+
+
+def html(content: str = "", tag: str = "div") -> ui.html:
+    """Build an element with HTML in which texts of others are escaped."""
+    return ui.html(content, sanitize=False, tag=tag)
+
+
+def image(address: str = "", text: str = "") -> ui.element:
+    """Build an image with its text for screen readers."""
+    element = ui.element("img")
+    element.props.update({"src": address, "alt": text} if address else {"alt": text})
+    return element
+
+
+def text_field(label: str, value: str) -> ui.input:
+    """Build a field for one line of text."""
+    control = ui.input(label, value=value)
+    control.props["aria-label"] = label
+    return control
 
 
 @contextmanager
@@ -23,13 +49,13 @@ def card(title: str, note: str = "") -> Iterator[ui.element]:
     """Build a framed section with a second-level heading."""
     with ui.element("section").classes("card") as section:
         section.props["aria-label"] = title
-        ui.html(f"<h2>{escape(title)}</h2>" + (f"<p class=note>{escape(note)}</p>" if note else ""), sanitize=False)
+        html(f"<h2>{escape(title)}</h2>" + (f"<p class=note>{escape(note)}</p>" if note else ""))
         yield section
 
 
 def text_html(text: str, tag: str = "p", classes: str = "") -> ui.html:
     """Build an element with escaped text."""
-    return ui.html(f'<{tag} class="{escape(classes)}">{escape(text)}</{tag}>', sanitize=False)
+    return html(f'<{tag} class="{escape(classes)}">{escape(text)}</{tag}>')
 
 
 def figures(rows: Sequence[tuple[str, str, str]]) -> str:
@@ -66,29 +92,17 @@ def images_html(images: Sequence[tuple[str, str, str]]) -> str:
 
 
 @contextmanager
-def work_in_progress(button: ui.button, place: ui.element) -> Iterator[None]:
-    """Disable a button and fill an element, which shows the progress, until the end of the block."""
-    button.disable()
-    place.clear()
-    try:
-        yield
-    finally:
-        button.enable()
-        place.clear()
-
-
-@contextmanager
 def dialog(classes: str = "") -> Iterator[None]:
     """Build and open a dialog with a button that closes it."""
     with ui.dialog(value=True) as box, ui.card().classes(classes):
         yield
-        ui.button("Close", on_click=box.close).props("flat no-caps")
+        ui.button("Close", on_click=box.close).props("flat")
 
 
 def select(label: str, options: Any, value: Any = None) -> ui.select:
     """Build a choice between options, a list or texts by their values; another value selects the first."""
     first = value if value in list(options) else next(iter(options), None)
-    control = ui.select(options, label=label, value=first).props("outlined dense options-dense")
+    control = ui.select(options, label=label, value=first)
     control.props["aria-label"] = label
     return control
 
@@ -109,9 +123,8 @@ class FileChoice:
         self, label: str, names: Sequence[str], value: object, look_up: Callable[[], Awaitable[Sequence[str]]],
         on_change: Callable[[], Awaitable[None] | None],
     ) -> None:  # fmt: skip
-        self.select = select(label, list(names), value)
-        self._look_up = look_up
-        self.select.on("popup-show", self._refresh)
+        self.select, self._look_up = select(label, list(names), value), look_up
+        self.select.on("popup-show", lambda: self.choose(self.name))
         self.select.on_value_change(on_change)
 
     @property
@@ -120,17 +133,11 @@ class FileChoice:
         return str(self.select.value or "")
 
     async def choose(self, name: str) -> None:
-        """Select a file that has just been written, if it exists."""
-        names = await self._look_up()
-        self._set(names, name if name in names else self.name)
-
-    async def _refresh(self) -> None:
-        """Update the names from disk."""
-        self._set(await self._look_up(), self.name)
-
-    def _set(self, names: Sequence[str], value: str) -> None:
-        if list(names) != self.select.options or value != self.name:
-            self.select.set_options(list(names), value=value if value in names else next(iter(names), None))
+        """Select one of the present files; another name changes nothing."""
+        names = list(await self._look_up())
+        value = next((n for n in (name, self.name) if n in names), next(iter(names), None))
+        if names != self.select.options or value != self.select.value:
+            self.select.set_options(names, value=value)
 
 
 class CommandLine:
@@ -138,15 +145,12 @@ class CommandLine:
 
     def __init__(self) -> None:
         with ui.element("div").classes("command").props('role="group" aria-label="Command line"'):
-            self._text = ui.html("", sanitize=False).classes("line")
-            button = ui.button("Copy", icon="content_copy")
-            button.props('flat no-caps dense aria-label="Copy the command line"')
+            self._text = html().classes("line")
+            button = ui.button("Copy", icon="content_copy").props('flat dense aria-label="Copy the command line"')
             button.on("click", js_handler=COPY)
-        self.line = ""
 
     def show(self, arguments: Sequence[str]) -> None:
         """Show the command line of these arguments."""
-        self.line = command_line(arguments)
         words = (f"<span>{escape(quoted(word))}</span>" for word in ("nerif", *arguments))  # lines break between them
         self._text.set_content(f"<code tabindex=0>{' '.join(words)}</code>")
 

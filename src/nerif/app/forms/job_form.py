@@ -18,7 +18,12 @@ __all__ = ["JobForm", "JobStatus"]
 
 EVERY = 0.7  # seconds
 LINES, NOTE = 3, "note: "  # of the log; beginning of a note
-ENDS = {"done": "It is done.", "failed": "It failed; end of the log:", "stopped": "It was stopped."}
+STATES = {
+    "queued": "It waits in the queue.", "held": "Start it under Runs: another server queued it.",
+    "running": "It is running.", "paused": "It is paused.", "done": "It is done.",
+    "failed": "It failed; end of the log:", "stopped": "It was stopped.",
+}  # fmt: skip
+ENDS = ("done", "failed", "stopped")
 
 
 class JobForm:
@@ -34,24 +39,22 @@ class JobForm:
     main : names of the fields at the top of the form
     out : returns the output, relative to the project; its folder is created
     before : called before the run is queued; an InputError prevents the run
+    ready : returns whether what the page sets besides the form is complete
     subject : subject of the run, part of the key that restores its status after a reload
-    on_continue : called by a button that continues with the output; None for no button
-    lines : number of log lines shown after success
-    on_end : called when the run has ended
+    status : further arguments of `JobStatus`
     """
 
     def __init__(
         self, work: Workspace, name: str, form: Form[Any], words: Callable[[], Sequence[str]], button: str,
         main: Sequence[str] = (), out: Callable[[], str] | None = None,
         before: Callable[[], Awaitable[None]] | None = None, subject: str = "",
-        on_continue: Callable[[str], Awaitable[None]] | None = None, lines: int = LINES,
-        on_end: Callable[[CommandRun], Awaitable[None]] | None = None,
+        ready: Callable[[], bool] = lambda: True, **status: Any,
     ) -> None:  # fmt: skip
-        self.work, self.name, self.words, self.out, self.before = work, name, words, out, before
+        self.work, self.name, self.words, self.out, self.before, self.ready = work, name, words, out, before, ready
         self.view = FormView(form, self._on_change, work.draft(name), main)
         self.command = CommandLine()
-        self.button = ui.button(button, icon="playlist_add", on_click=self._start).props("unelevated no-caps")
-        self.status = JobStatus(work, f"{name}.run {subject}".strip(), on_end, on_continue, lines)
+        self.button = ui.button(button, icon="playlist_add", on_click=self._start).props("unelevated")
+        self.status = JobStatus(work, f"{name}.run {subject}".strip(), **status)
         self.show()
 
     @property
@@ -63,7 +66,7 @@ class JobForm:
         """Update the command line and the button."""
         if hasattr(self, "command"):
             self.command.show(self.arguments)
-            self.button.set_enabled(self.view.valid)
+            self.button.set_enabled(self.view.valid and self.ready())
 
     def _on_change(self) -> None:
         self.work.keep(self.name, self.view.form.changed(self.view.values))
@@ -77,9 +80,8 @@ class JobForm:
             if self.out is not None:
                 self.work.project.path(self.out()).parent.mkdir(parents=True, exist_ok=True)
             words = self.arguments
-            self.status.follow(
-                self.work.jobs.add(words, f"{words[0].capitalize()} {self.work.project.title(words[1])}")
-            )
+            title = f"{words[0].capitalize()} {self.work.project.title(words[1])}"
+            self.status.follow(self.work.jobs.add(words, title))
 
 
 class JobStatus:
@@ -111,17 +113,18 @@ class JobStatus:
         self.job = job.id
         self.work.keep(self.name, {"job": job.id})
         self.further.clear()
-        self._show("It waits in the queue.")
+        self._show(STATES["queued"])
 
-    def _show(self, text: str, log: Sequence[str] = ()) -> None:
-        if self._content == (text, *log):
+    def _show(self, *content: str) -> None:
+        """Show the state and lines of the log."""
+        if self._content == content:
             return
-        self._content = (text, *log)
+        self._content = content
         self.place.clear()
         with self.place:
-            text_html(text, classes="status")
-            if log:
-                text_html("\n".join(log), "pre", "output")
+            text_html(content[0], classes="status")
+            if content[1:]:
+                text_html("\n".join(content[1:]), "pre", "output")
 
     def _forget(self) -> None:
         """Show no run; the draft of a run started in another tab stays."""
@@ -141,22 +144,18 @@ class JobStatus:
             return
         if id != self.job:  # another run has started meanwhile
             return
-        last = len(log) - self._lines.get(job.state, LINES)
-        lines = [line for i, line in enumerate(log) if i >= last or (job.state in ENDS and line.startswith(NOTE))]
-        lines = [line.rpartition("\r")[2] for line in lines]  # the last state of a progress bar
-        if job.state not in ENDS:
-            waits = {"queued": "It waits in the queue.", "held": "Start it under Runs: another server queued it."}
-            self._show(waits.get(job.state, f"It is {job.state}."), lines[-1:])
+        over = job.state in ENDS
+        last = len(log) - (self._lines.get(job.state, LINES) if over else 1)
+        lines = [line for i, line in enumerate(log) if i >= last or (over and line.startswith(NOTE))]
+        self._show(STATES[job.state], *(line.rpartition("\r")[2] for line in lines))  # the last of a progress bar
+        if not over:
             return
-        self._show(ENDS[job.state], lines)
         self._forget()
         if self._on_continue is not None and job.state == "done" and job.file:
-            self._go_on(self._on_continue, self.work.project.relative(job.file))
+            on_continue, file = self._on_continue, self.work.project.relative(job.file)
+            self.further.clear()
+            with self.further:
+                button = ui.button(f"Go on with {file}", icon="arrow_forward", on_click=lambda: on_continue(file))
+                button.props("unelevated")
         if self._on_end is not None:
             await self._on_end(job)
-
-    def _go_on(self, on_continue: Callable[[str], Awaitable[None]], file: str) -> None:
-        self.further.clear()
-        with self.further:
-            button = ui.button(f"Go on with {file}", icon="arrow_forward", on_click=lambda: on_continue(file))
-            button.props("unelevated no-caps")

@@ -10,6 +10,8 @@ from typing import Any
 
 from nicegui import ui
 
+from nerif.app.forms.elements import html
+
 __all__ = ["RangeSlider", "SliderScale"]
 
 STEPS = 400
@@ -36,7 +38,7 @@ class RangeSlider:
     ) -> None:  # fmt: skip
         self.value, self._text, self._label = value, text, label
         with ui.element("div").classes("slider"):
-            self._output = ui.html("", sanitize=False).classes("at")
+            self._output = html().classes("at")
             self._input = ui.element("input").classes("range").props("type=range min=0 step=1")
             self._input.props.update({"max": max(last, 0), "value": value, "aria-label": label})
 

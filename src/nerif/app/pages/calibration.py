@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import fields
+from html import escape
 from typing import Any
 
 from nicegui import ui
 
-from nerif.app.forms.elements import CommandLine, card, refusals, select, text_html
+from nerif.app.forms.elements import card, html, refusals, select, text_field, text_html
 from nerif.app.forms.form import Form
-from nerif.app.forms.form_view import FormView
-from nerif.app.forms.job_form import JobStatus
+from nerif.app.forms.job_form import JobForm
 from nerif.app.pages.page import Hint, Page
 from nerif.app.project.folder import Contents
 from nerif.app.project.jobs import CommandRun
@@ -53,11 +53,8 @@ class CalibrationPage:
     """The page in one tab."""
 
     def __init__(self, work: Workspace, contents: Contents) -> None:
-        self.work, self.contents = work, contents
-        draft = work.draft(PAGE.name)
-        self.draft = dict(draft)
-        self.exclusions: dict[str, list[str]] = {k: list(v) for k, v in draft.get("leave_out", {}).items()}
-        self.values: dict[str, dict[str, Any]] = {name: dict(draft.get(name, {})) for name in ("target", "ruler")}
+        self.work, self.contents, self.draft = work, contents, dict(work.draft(PAGE.name))
+        self.exclusions: dict[str, list[str]] = {k: list(v) for k, v in self.draft.get("leave_out", {}).items()}
         self.views: dict[str, View] = {}
         self.errors: dict[str, ImageError] = {}
         self.request = 0  # number of the last drawing of the rig
@@ -67,19 +64,12 @@ class CalibrationPage:
             with card("Calibrate"), ui.element("div").classes("form"):
                 if not experiments:
                     text_html("There are no images in this folder yet; the page Images says where they go.")
-                self.experiment = select("Experiment", experiments, draft.get("experiment")).classes("short")
-                self.way = select("From", WAYS, bool(draft.get("simple", False))).classes("short")
-                self.out = ui.input("Calibration to write", value=str(draft.get("out", "calibration.toml")))
-                self.out.props("outlined dense debounce=250").props["aria-label"] = "Calibration to write"
-                self.out.on_value_change(self._show)
-                self.note = ui.element("div")
+                self.experiment = select("Experiment", experiments, self.draft.get("experiment")).classes("short")
+                self.way = select("From", WAYS, bool(self.draft.get("simple", False))).classes("short")
+                self.out = text_field("Calibration to write", str(self.draft.get("out", "calibration.toml")))
+                self.note = html()
                 self.place = ui.element("div").classes("form")
-                self.start = ui.button("Calibrate", icon="play_arrow", on_click=self._start)
-                self.start.props("unelevated no-caps")
             with ui.element("div").classes("stack"):
-                with card("The same on the command line"):
-                    self.command = CommandLine()
-                    self.status = JobStatus(work, f"{PAGE.name}.run", self._on_end)
                 with card("The rig"):
                     self.calibration = select("Calibration", []).classes("short")
                     self.rig = ui.element("div").classes("rig")
@@ -94,8 +84,9 @@ class CalibrationPage:
         """Fill the page and handle changes."""
         await self._update_form()
         await self._choose_calibration()
-        self.experiment.on_value_change(self._update_form)
-        self.way.on_value_change(self._update_form)
+        for control in (self.experiment, self.way):
+            control.on_value_change(self._update_form)
+        self.out.on_value_change(self._show)
         self.calibration.on_value_change(self._show_rig)
         self.view.on_value_change(self._show_images)
         await self._show_rig()
@@ -115,24 +106,22 @@ class CalibrationPage:
 
     async def _update_form(self) -> None:
         """Build the form of another experiment or of the other way."""
-        self.views = {}
-        if self.experiment.value:
-            with refusals():
+        self.views, form = {}, form_of(self.simple)
+        with refusals():
+            if self.experiment.value:
                 views = await self.work.in_thread(self.work.project.views, self.experiment.value)
                 self.views = {view.name: view for view in views}
-        settings: dict[str, Any] = {}
-        if self.settings:
-            with refusals():
-                settings = read_toml(self.work.project.path(self.settings))
-        form = form_of(False)
         with refusals():
-            form = form_of(self.simple, settings)
+            if self.settings:
+                form = form_of(False, read_toml(self.work.project.path(self.settings)))
         self.place.clear()
         with self.place:
-            values = self.values["ruler" if self.simple else "target"]
-            self.form = FormView(form, self._show, values, SIMPLE_MAIN if self.simple else MAIN)
-        names = list(self.views)
-        name = self.draft.get("view")
+            self.job = JobForm(
+                self.work, f"{PAGE.name}.{'ruler' if self.simple else 'target'}", form, self._words, "Calibrate",
+                SIMPLE_MAIN if self.simple else MAIN, lambda: self.out.value,
+                ready=lambda: bool(self.experiment.value and self.out.value), on_end=self._on_end,
+            )  # fmt: skip
+        names, name = list(self.views), self.draft.get("view")
         self.view.set_options(names, value=name if name in names else next(iter(names), None))
         self._show()
 
@@ -141,15 +130,13 @@ class CalibrationPage:
         """Names of the excluded images of this experiment."""
         return self.exclusions.setdefault(self.experiment.value or "", [])
 
-    def arguments(self) -> list[str]:
-        """Return the arguments of nerif that the page is set to."""
+    def _words(self) -> list[str]:
         words = ["calibrate", self.experiment.value or "FOLDER", "-o", word_of(self.out.value or "NAME.toml")]
         words += ["--config", self.settings] if self.settings else []
-        words += ["--simple"] if self.simple else []
-        words += self.form.arguments
-        exclusions = [] if self.simple else map(word_of, self.excluded_images)
-        words += ["--leave-out", *exclusions] if self.excluded_images and not self.simple else []
-        return [*words, "--force"] if self._exists() else words
+        words += ["--force"] if self._exists() else []
+        if self.simple:
+            return [*words, "--simple"]
+        return [*words, "--leave-out", *map(word_of, self.excluded_images)] if self.excluded_images else words
 
     def _exists(self) -> bool:
         try:
@@ -158,38 +145,20 @@ class CalibrationPage:
             return False
 
     def _show(self) -> None:
-        if not hasattr(self, "form"):
-            return
-        self.values["ruler" if self.simple else "target"] = self.form.form.changed(self.form.values)
         self.draft = {
             "experiment": self.experiment.value, "simple": self.simple, "out": self.out.value, "view": self.view.value,
-            "leave_out": self.exclusions, "calibration": self.calibration.value, **self.values,
+            "leave_out": self.exclusions, "calibration": self.calibration.value,
         }  # fmt: skip
         self.work.keep(PAGE.name, self.draft)
-        self.command.show(self.arguments())
+        self.job.show()
         notes = [f"Its settings are those of {self.settings}, but for what is changed here."] if self.settings else []
         notes += [f"{self.out.value} is there; it is replaced."] if self._exists() else []
-        self.note.clear()
-        with self.note:
-            for text in notes:
-                text_html(text, classes="note")
-        self.start.set_enabled(bool(self.experiment.value and self.out.value) and self.form.valid)
+        self.note.set_content("".join(f"<p class=note>{escape(text)}</p>" for text in notes))
 
     def _toggle(self, name: str) -> None:
         names = self.excluded_images
-        if name in names:
-            names.remove(name)
-        else:
-            names.append(name)
+        names.remove(name) if name in names else names.append(name)
         self._show()
-
-    # -- the run -------------------------------------------------------------------------------------------------
-
-    def _start(self) -> None:
-        with refusals():
-            self.form.record()
-            self.work.project.path(self.out.value).parent.mkdir(parents=True, exist_ok=True)
-            self.status.follow(self.work.jobs.add(self.arguments(), f"Calibrate {self.experiment.value}"))
 
     async def _on_end(self, job: CommandRun) -> None:
         """Show what the run wrote."""
@@ -229,7 +198,7 @@ class CalibrationPage:
     async def _show_images(self) -> None:
         """Show the images of the selected view."""
         view = self.views.get(self.view.value or "")
-        if view is None or not self.form.valid:
+        if view is None or not self.job.view.valid:
             return
         self._show()
         with refusals():
@@ -238,7 +207,7 @@ class CalibrationPage:
 
     def _targets(self) -> dict[str, CalibrationTarget]:
         """The targets to detect; for a ruler, which needs none, those of the form's defaults."""
-        record = form_of(False).record if self.simple else self.form.record()
+        record = form_of(False).record if self.simple else self.job.view.record()
         return {"target": record.target, "background": record.target.scaled(record.background_scale)}
 
     def _display_key(self) -> tuple[Any, ...]:
@@ -246,7 +215,7 @@ class CalibrationPage:
 
     async def _update_images(self) -> None:
         """Detect again if target, experiment or view has changed."""
-        if self.form.valid and self._display_key() != self._display:
+        if self.job.view.valid and self._display_key() != self._display:
             await self._show_images()
 
 
@@ -265,4 +234,4 @@ HINT = Hint(
     "its background behind the flow.",
     done=lambda work: bool(work.project.contents().calibrations),
 )
-PAGE = Page("calibration", "Calibration", "/calibration", ABOUT, build, HINT)
+PAGE = Page("calibration", "Calibration", ABOUT, build, HINT)

@@ -10,7 +10,7 @@ from nicegui import ui
 from PIL import Image
 
 from nerif.analysis.consistency_file import CheckFindings, read_findings
-from nerif.app.forms.elements import CommandLine, FileChoice, card, items_html, refusals, table_html, text_html
+from nerif.app.forms.elements import CommandLine, FileChoice, card, html, items_html, refusals, table_html, text_html
 from nerif.app.forms.form import Form
 from nerif.app.forms.job_form import JobForm, JobStatus
 from nerif.app.pages.page import Hint, Page
@@ -40,14 +40,7 @@ def findings_file(measurement: str) -> str:
 
 
 class CheckPage:
-    """The page in one tab.
-
-    Parameters
-    ----------
-    work : Workspace
-    measurements : their names
-    models : names of the surfaces of bodies
-    """
+    """The page in one tab, from the names of measurements and of surfaces of bodies."""
 
     def __init__(self, work: Workspace, measurements: Sequence[str], models: Sequence[str]) -> None:
         self.work = work
@@ -56,17 +49,18 @@ class CheckPage:
                 with card("Do the views agree?", AGREE), ui.element("div").classes("form"):
                     name = work.draft(PAGE.name).get("measurement")
                     self.choice = FileChoice("Measurement", measurements, name, work.measurements, self._on_choice)
+                    record = Check(work.project.path(self.choice.name))
                     self.views = JobForm(
-                        work, f"{PAGE.name}.views", Form(self._record(), only=VIEW_SETTINGS), self._view_words,
-                        "Compare the views", out=lambda: findings_file(self.choice.name), lines=0,
-                        on_end=self._on_end,
+                        work, f"{PAGE.name}.views", Form(record, only=VIEW_SETTINGS),
+                        lambda: ["check", self.choice.name, "--findings", findings_file(self.choice.name)],
+                        "Compare the views", out=lambda: findings_file(self.choice.name), lines=0, on_end=self._on_end,
                     )  # fmt: skip
                 with card("Is the rig as it was calibrated?", REFINE), ui.element("div").classes("form"):
-                    record = replace(self._record(), refine=("cameras",))
-                    self.rig = JobForm(
-                        work, f"{PAGE.name}.rig", Form(record, only=RIG_SETTINGS), self._refine_words, "Refine",
-                        lines=RIG_LINES,
+                    rig = JobForm(
+                        work, f"{PAGE.name}.rig", Form(replace(record, refine=("cameras",)), only=RIG_SETTINGS),
+                        lambda: ["check", self.choice.name, "--refine", "cameras"], "Refine", lines=RIG_LINES,
                     )  # fmt: skip
+                self.forms = [self.views, rig]
                 with card("Is there a model in the flow?", MODEL), ui.element("div").classes("form"):
                     self._build_model(models)
             with ui.element("div").classes("stack"):
@@ -77,73 +71,48 @@ class CheckPage:
                 with card("Undone") as self.correction:
                     self.correction_status = JobStatus(work, f"{PAGE.name}.undone", on_continue=self.choice.choose)
         self.correction.set_visibility(bool(self.correction_status.job))
-        self._show_outlines()
         self.show()
 
     def _build_model(self, models: Sequence[str]) -> None:
-        """The form that adds a body to the measurement."""
-        self.body: JobForm | None = None
         if not models:
             text_html(NO_MODEL, classes="status")
             return
-        work = self.work
-        name = work.draft(f"{PAGE.name}.body").get("model")
-        self.model = FileChoice("Model", models, name, work.models, self._on_model)
-        self.body = JobForm(
-            work, f"{PAGE.name}.body.form", Form(BodyInFlow(Path()), only=MODEL_SETTINGS), self._body_words,
-            "Add the model", out=self._with_model, on_end=self._on_body,
+        draft = f"{PAGE.name}.body"
+
+        def on_model() -> None:
+            self.work.keep(draft, {"model": model.name})
+            body.show()
+
+        model = FileChoice("Model", models, self.work.draft(draft).get("model"), self.work.models, on_model)
+        body = JobForm(
+            self.work, f"{draft}.form", Form(BodyInFlow(Path()), only=MODEL_SETTINGS),
+            lambda: ["body", self.choice.name, model.name, "--out", self._with_model(), "--force"], "Add the model",
+            out=self._with_model, on_end=self._on_end,
         )  # fmt: skip
+        self.forms.append(body)
 
     def _with_model(self) -> str:
         """The measurement with the model, in place of an earlier one."""
         return f"{self.choice.name.removesuffix('.nc')}.body.nc"
 
-    def _body_words(self) -> list[str]:
-        return ["body", self.choice.name, self.model.name, "--out", self._with_model(), "--force"]
+    def _on_choice(self) -> None:
+        self.work.keep(PAGE.name, {"measurement": self.choice.name})
+        for form in self.forms:
+            form.show()
+        self.correction.set_visibility(bool(self.correction_status.job))
+        self.show()
 
-    def _on_model(self) -> None:
-        self.work.keep(f"{PAGE.name}.body", {"model": self.model.name})
-        assert self.body is not None
-        self.body.show()
+    async def _on_end(self, job: CommandRun) -> None:
+        self.show()
 
-    async def _on_body(self, job: CommandRun) -> None:
-        self._show_outlines()
-
-    def _show_outlines(self) -> None:
-        """Show the outlines of the model over the measured values, once there is a measurement with it."""
+    def show(self) -> None:
+        """Show findings, which outlive page and server, and outlines of a model of the selected measurement."""
         figure = self.work.project.path(self._with_model().removesuffix(".nc") + ".bodies.png")
         self.outlines.clear()
         self.outline_card.set_visibility(figure.is_file())
         if figure.is_file():
             with self.outlines, Image.open(figure, formats=("PNG",)) as image:
                 ui.image(image.copy()).props('alt="Outlines of the model in each view"')
-
-    def _record(self) -> Check:
-        return Check(self.work.project.path(self.choice.name))
-
-    def _view_words(self) -> list[str]:
-        return ["check", self.choice.name, "--findings", findings_file(self.choice.name)]
-
-    def _refine_words(self) -> list[str]:
-        return ["check", self.choice.name, "--refine", "cameras"]
-
-    def _on_choice(self) -> None:
-        self.work.keep(PAGE.name, {"measurement": self.choice.name})
-        self.correction.set_visibility(bool(self.correction_status.job))
-        self.views.show()
-        self.rig.show()
-        if self.body is not None:
-            self.body.show()
-        self._show_outlines()
-        self.show()
-
-    async def _on_end(self, job: CommandRun) -> None:
-        """Show what the run has written."""
-        if job.state == "done":
-            self.show()
-
-    def show(self) -> None:
-        """Show the findings of the selected measurement, which outlive page and server."""
         name, result = self.choice.name, None
         messages: list[str] = []
         with refusals(messages.append):
@@ -166,13 +135,13 @@ class CheckPage:
 
     def _show(self, name: str, result: CheckFindings) -> None:
         """The verdicts, and the correction that is offered."""
-        ui.html(views_table(result), sanitize=False)
+        html(views_table(result))
         if result.findings:
-            ui.html(f"<h3>Found</h3>{items_html([str(finding) for finding in result.findings])}", sanitize=False)
+            html(f"<h3>Found</h3>{items_html([str(finding) for finding in result.findings])}")
         elif result.views:
             text_html("No problems found.", classes="status")
         if result.remarks:
-            ui.html(f"<h3>Notes</h3>{items_html(result.remarks, '')}", sanitize=False)
+            html(f"<h3>Notes</h3>{items_html(result.remarks, '')}")
         if result.correctable:
             out = self.work.project.free_name(f"{name.removesuffix('.nc')}.corrected.nc")
             arguments = ["check", name, "--out", out, *self.views.view.arguments]
@@ -186,11 +155,9 @@ class CheckPage:
                     self.correction.set_visibility(True)
                     button.disable()
 
-            button = ui.button("Correct the mistakes", icon="auto_fix_high", on_click=correct)
-            button.props("unelevated no-caps")
+            button = ui.button("Correct the mistakes", icon="auto_fix_high", on_click=correct).props("unelevated")
         elif result.views and not result.findings:
-            link = "<a href='reconstruct'>Go on to Reconstruct</a>"
-            ui.html(f"<p>{link}</p>", sanitize=False)
+            html("<p><a href='reconstruct'>Go on to Reconstruct</a></p>")
 
 
 def views_table(result: CheckFindings) -> str:
@@ -222,4 +189,4 @@ HINT = Hint(
     done=lambda work: any((work.project.folder / OWN / "checks").rglob("*.json")),
 )
 ABOUT = "Errors of the data and of the calibration, before the reconstruction."
-PAGE = Page("check", "Check", "/check", ABOUT, build, HINT)
+PAGE = Page("check", "Check", ABOUT, build, HINT)

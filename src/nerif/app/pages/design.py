@@ -9,7 +9,7 @@ from html import escape
 import torch
 from nicegui import ui
 
-from nerif.app.forms.elements import CommandLine, card, figures, items_html
+from nerif.app.forms.elements import CommandLine, card, figures, html, items_html
 from nerif.app.forms.form import Form
 from nerif.app.forms.form_view import FormView
 from nerif.app.pages.page import Hint, Page
@@ -44,13 +44,13 @@ def build(work: Workspace) -> None:
     """Build the page."""
     form = Form(Design(), ("design",), without=("config", "out", "force"))
     with ui.element("div").classes("columns"):
-        with card("Rig and flow"), ui.element("div").classes("form") as left:
-            pass
+        with card("Rig and flow"):
+            left = ui.element("div").classes("form")
         with ui.element("div").classes("stack"):
             with card("What to expect"):
-                notice = ui.html("", sanitize=False).props('aria-live="polite"')
+                notice = html().props('aria-live="polite"')
             with card("From above, to scale"):
-                drawing = ui.html("", sanitize=False).classes("drawing")
+                drawing = html().classes("drawing")
             with card("The same on the command line"):
                 command = CommandLine()
 
@@ -63,15 +63,14 @@ def build(work: Workspace) -> None:
         notice.set_content(_text(expect(request.ring, request.flow), request))
         drawing.set_content(_rig_drawing(request.ring.cameras(), request.flow.flow_size))
 
+    def reset() -> None:
+        for name in list(form.changed(view.values)):
+            view.set(name, form.field(name).default)
+
     with left:
         view = FormView(form, show, work.draft(PAGE.name), MAIN, SLIDERS)
-        ui.button("Back to the defaults", on_click=lambda: _reset(form, view)).props("flat no-caps")
+        ui.button("Back to the defaults", on_click=reset).props("flat")
     show()
-
-
-def _reset(form: Form[Design], view: FormView[Design]) -> None:
-    for name in list(form.changed(view.values)):
-        view.set(name, form.field(name).default)
 
 
 def _text(e: Expectation, request: Design) -> str:
@@ -121,21 +120,18 @@ def _rig_drawing(cameras: Sequence[Camera], flow_size: float) -> str:
         y = height - (float(point[1] - low[1]) + EDGE * reach) * unit
         return f"{x:.1f},{y:.1f}"
 
+    def circle(centre: torch.Tensor, radius: float, colour: str, title: str) -> str:
+        x, y = at(centre).split(",")
+        return f'<circle cx="{x}" cy="{y}" r="{radius:.1f}" fill="var(--{colour})"><title>{title}</title></circle>'
+
     views, things = [], []
     for camera, (lens, ends) in zip(cameras, rays, strict=True):
-        corners = " ".join(map(at, (lens[0], ends[0], ends[1], lens[1])))
-        views.append(f'<polygon points="{corners}" fill="var(--plot)" opacity="0.07"/>')
-        a, b = (at(end).split(",") for end in ends)
-        things.append(
-            f'<line x1="{a[0]}" y1="{a[1]}" x2="{b[0]}" y2="{b[1]}" stroke="currentColor" stroke-width="5">'
-            f"<title>background of {escape(camera.name)}</title></line>"
-        )
-        x, y = at(lens.mean(dim=0)).split(",")
-        name = f"<title>{escape(camera.name)}</title>"
-        things.append(f'<circle cx="{x}" cy="{y}" r="8" fill="var(--plot)">{name}</circle>')
-    x, y = at(torch.zeros(2)).split(",")
-    radius = max(flow_size / 2 * unit, 3)
-    flow = f'<circle cx="{x}" cy="{y}" r="{radius:.1f}" fill="var(--flow)"><title>flow</title></circle>'
+        name, (a, b) = escape(camera.name), map(at, ends)
+        views.append(f'<polygon points="{at(lens[0])} {a} {b} {at(lens[1])}" fill="var(--plot)" opacity="0.07"/>')
+        title = f"<title>background of {name}</title>"
+        things.append(f'<polyline points="{a} {b}" stroke="currentColor" stroke-width="5">{title}</polyline>')
+        things.append(circle(lens.mean(dim=0), 8, "plot", name))
+    flow = circle(torch.zeros(2), max(flow_size / 2 * unit, 3), "flow", "flow")
     bar = 10 ** math.floor(math.log10(reach / 3))
     bar *= max(k for k in (1, 2, 5) if k * bar <= reach / 3)
     scale = (
@@ -151,8 +147,7 @@ def _rig_drawing(cameras: Sequence[Camera], flow_size: float) -> str:
 def _outline(camera: Camera) -> tuple[torch.Tensor, torch.Tensor]:
     """Start and end of the two outermost rays of the middle row in x and y, (2, 2) in mm."""
     height, width = camera.image_size
-    ends = torch.tensor([[0.0, (height - 1) / 2], [width - 1.0, (height - 1) / 2]], dtype=torch.float64)
-    rays = camera.rays(ends)
+    rays = camera.rays(torch.tensor([[u, (height - 1) / 2] for u in (0.0, width - 1.0)], dtype=torch.float64))
     return rays.origin[:, :2], rays.end_points[:, :2]
 
 
@@ -164,4 +159,4 @@ HINT = Hint(
     values={"design": {name: list(v) if isinstance(v, tuple) else v for name, v in RIG.items()}},
 )
 ABOUT = "Displacement, blur and resolution of a rig before it is built."
-PAGE = Page("design", "Design", "/design", ABOUT, build, HINT)
+PAGE = Page("design", "Design", ABOUT, build, HINT)

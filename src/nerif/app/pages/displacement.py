@@ -8,7 +8,7 @@ from pathlib import Path
 
 from nicegui import ui
 
-from nerif.app.forms.elements import FileChoice, card, refusals, select, text_html, work_in_progress
+from nerif.app.forms.elements import FileChoice, card, html, refusals, select, text_field, text_html
 from nerif.app.forms.form import Form
 from nerif.app.forms.job_form import JobForm
 from nerif.app.pages.page import Hint, Page
@@ -29,13 +29,7 @@ MAIN = ("method", "smoothness", "lower", "upper", "max_sigma", "min_correlation"
 
 
 class DisplacementPage:
-    """The page in one tab.
-
-    Parameters
-    ----------
-    work : Workspace
-    contents : files of the project
-    """
+    """The page in one tab."""
 
     def __init__(self, work: Workspace, contents: Contents) -> None:
         self.work, draft = work, work.draft(PAGE.name)
@@ -46,20 +40,17 @@ class DisplacementPage:
                     self.experiment = select("Experiment", list(contents.experiments), draft.get("experiment"))
                     calibrations = list(contents.calibrations)
                     self.calibration = select("Calibration", calibrations, draft.get("calibration"))
-                    self.out = ui.input("Measurement to write", value=work.project.free_name("measurement.nc"))
-                    self.out.props('outlined dense aria-label="Measurement to write"')
+                    self.out = text_field("Measurement to write", work.project.free_name("measurement.nc"))
                     record = Displacement(Path("."), Path("."), Path("measurement.nc"))
-                    form = Form(record, without=BY_PAGE)
                     self.job = JobForm(
-                        work, f"{PAGE.name}.run", form, self._words, "Find all displacements", MAIN,
-                        lambda: str(self.out.value), on_continue=self._on_continue,
+                        work, f"{PAGE.name}.run", Form(record, without=BY_PAGE), self._words, "Find all displacements",
+                        MAIN, lambda: str(self.out.value), on_continue=self._on_continue,
                     )  # fmt: skip
                     for control in (self.experiment, self.calibration, self.out):
                         control.on_value_change(self._on_choice)
                 with card("Preview of one view", "With these settings, before all views are done."):
                     self.view = select("View", []).classes("short")
-                    self.button = ui.button("Preview", icon="visibility", on_click=self.preview)
-                    self.button.props("outline no-caps")
+                    self.button = ui.button("Preview", icon="visibility", on_click=self.preview).props("outline")
                     self.display = ui.element("div").props('aria-live="polite"')
             self._views()
         else:
@@ -81,10 +72,8 @@ class DisplacementPage:
         self.out.set_value(self.work.project.free_name("measurement.nc"))
 
     def _words(self) -> list[str]:
-        return [
-            "displacement", str(self.experiment.value), "--calibration", str(self.calibration.value),
-            "--out", word_of(self.out.value),
-        ]  # fmt: skip
+        files = [str(self.experiment.value), "--calibration", str(self.calibration.value)]
+        return ["displacement", *files, "--out", word_of(self.out.value)]
 
     def _on_choice(self) -> None:
         selection = {"experiment": self.experiment.value, "calibration": self.calibration.value}
@@ -101,36 +90,31 @@ class DisplacementPage:
     async def preview(self) -> None:
         """Find the displacements of one view and show them."""
         lines: list[str] = []
-        html = ""
-        with work_in_progress(self.button, self.display), refusals(lines.append):
-            with self.display:
-                ui.spinner(size="lg").props('aria-label="Working"')
+        maps = ""
+        self.button.disable()
+        self.display.clear()
+        with self.display:
+            ui.spinner(size="lg").props('aria-label="Working"')
+        with refusals(lines.append):
+            folder, calibration = map(self.work.project.path, (self.experiment.value, self.calibration.value))
             request = replace(
-                self.job.view.record(), folder=self.work.project.path(str(self.experiment.value)),
-                calibration=self.work.project.path(str(self.calibration.value)), views=(str(self.view.value),),
+                self.job.view.record(), folder=folder, calibration=calibration, views=(str(self.view.value),),
                 images=False,
             )  # fmt: skip
-
-            def work() -> str:
-                numbers = range(request.frame, request.frame + request.average)
-                measurement, _ = measure_instant(request.recording(), numbers, lines.append, processes=1)
-                return maps_html(measurement)
-
-            html = await self.work.in_thread(work)
+            numbers = range(request.frame, request.frame + request.average)
+            maps = await self.work.in_thread(
+                lambda: maps_html(measure_instant(request.recording(), numbers, lines.append, processes=1)[0])
+            )
+        self.button.enable()
+        self.display.clear()
         with self.display:
             for text in lines:
                 text_html(text, classes="status")
-            ui.html(html, sanitize=False)
+            html(maps)
 
 
 class MeasurementCard:
-    """Maps of the views of a measurement, and the editor of its masks.
-
-    Parameters
-    ----------
-    work : Workspace
-    measurements : names of the measurements
-    """
+    """Maps of the views of one of the measurements, and the editor of its masks."""
 
     def __init__(self, work: Workspace, measurements: Sequence[str]) -> None:
         self.work = work
@@ -146,25 +130,18 @@ class MeasurementCard:
             self.place = ui.element("div").classes("stack")
         ui.timer(0.05, self._masks, once=True)
 
-    @property
-    def name(self) -> str:
-        """Name of the selected measurement."""
-        return self.choice.name
-
-    def _read(self, name: str) -> Measurement:
-        return self.work.project.from_cache(name, "measurement", Measurement.read)
-
     async def _on_choice(self) -> None:
-        self.work.keep(PAGE.name, {**self.work.draft(PAGE.name), "measurement": self.name})
+        self.work.keep(PAGE.name, {**self.work.draft(PAGE.name), "measurement": self.choice.name})
         self.maps.clear()
         await self._maps()
         await self._masks()
 
     async def _measurement(self) -> tuple[str, Measurement] | None:
         """Read the selected measurement; None if another one has been selected meanwhile."""
-        name = self.name
-        measurement = await self.work.in_thread(self._read, name)
-        return (name, measurement) if name == self.name else None
+        name = self.choice.name
+        read = self.work.project.from_cache
+        measurement = await self.work.in_thread(read, name, "measurement", Measurement.read)
+        return (name, measurement) if name == self.choice.name else None
 
     async def _maps(self) -> None:
         """Show the maps unless they are folded or shown already."""
@@ -173,12 +150,11 @@ class MeasurementCard:
         with refusals():
             if (selection := await self._measurement()) is None:
                 return
-            html = await self.work.in_thread(maps_html, selection[1])
-            if selection[0] != self.name:
-                return
-            self.maps.clear()
-            with self.maps:
-                ui.html(html, sanitize=False)
+            maps = await self.work.in_thread(maps_html, selection[1])
+            if selection[0] == self.choice.name:
+                self.maps.clear()
+                with self.maps:
+                    html(maps)
 
     async def _masks(self) -> None:
         self.place.clear()
@@ -206,4 +182,4 @@ HINT = Hint(
     done=lambda work: bool(work.project.contents().measurements),
 )
 ABOUT = "How far the background is shifted, view by view."
-PAGE = Page("displacement", "Displacement", "/displacement", ABOUT, build, HINT)
+PAGE = Page("displacement", "Displacement", ABOUT, build, HINT)

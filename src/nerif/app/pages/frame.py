@@ -11,7 +11,7 @@ from pathlib import Path
 
 from nicegui import ui
 
-from nerif.app.forms.elements import dialog, refusals, text_html
+from nerif.app.forms.elements import dialog, html, refusals, text_html
 from nerif.app.pages.guide import guide
 from nerif.app.pages.page import Page
 from nerif.app.project.jobs import OPEN, CommandRun
@@ -25,19 +25,18 @@ __all__ = ["JobsDrawer", "frame"]
 ASSETS = Path(__file__).parents[1] / "assets"
 EVERY = 1.0  # seconds
 LIMIT = 30  # runs in the drawer
+RESUME, REMOVE = {"resume": "Go on"}, {"remove": "Forget"}
 ACTIONS = {
-    "running": ("pause", "stop"),
-    "queued": ("first", "earlier", "later", "stop"),
-    "paused": ("resume", "stop", "remove"),
-    "done": ("remove",),
-    "failed": ("resume", "remove"),
-    "stopped": ("resume", "remove"),
-    "held": ("start", "remove"),
+    "running": {"pause": "Pause", "stop": "Stop"},
+    "queued": {"first": "Next", "earlier": "Earlier", "later": "Later", "stop": "Cancel"},
+    "paused": {**RESUME, "stop": "Stop", **REMOVE},
+    "done": REMOVE,
+    "failed": {**RESUME, **REMOVE},
+    "stopped": {**RESUME, **REMOVE},
+    "held": {"start": "Start", **REMOVE},
 }
-NAMES = {
-    "pause": "Pause", "stop": "Stop", "resume": "Go on", "remove": "Forget", "first": "Next", "earlier": "Earlier",
-    "later": "Later", "start": "Start",
-}  # fmt: skip
+"""What can be done with a run in a state: methods of Jobs, or MOVES, and labels of their buttons."""
+MOVES = {"first": -1_000_000, "earlier": -1, "later": 1}  # places in the queue
 
 
 @cache
@@ -54,11 +53,11 @@ def frame(work: Workspace, page: Page, pages: Sequence[Page]) -> Iterator[None]:
     ui.add_body_html('<a class="skip" href="#main">Skip to the page</a>')
     with ui.header(elevated=False).classes("top"):
         menu = ui.button(icon="menu").props('flat round aria-label="Pages"')
-        ui.html(
-            f"<span class=brand>nerif</span><span class=project title='{escape(str(work.project.folder))}'>"
-            f"<span class=parent>{escape(str(work.project.folder).removesuffix(work.project.name))}</span>"
-            f"{escape(work.project.name)}</span>", sanitize=False,
-        ).classes("where")  # fmt: skip
+        folder, name = escape(str(work.project.folder)), escape(work.project.name)
+        parent = f"<span class=parent>{folder.removesuffix(name)}</span>"
+        html(
+            f"<span class=brand>nerif</span><span class=project title='{folder}'>{parent}{name}</span>"
+        ).classes("where")
         ui.space()
         drawer = JobsDrawer(work)
         _switch(dark)
@@ -69,12 +68,12 @@ def frame(work: Workspace, page: Page, pages: Sequence[Page]) -> Iterator[None]:
             f"<span class=number>{i}</span>{escape(p.title)}</a></li>"
             for i, p in enumerate(pages, start=1)
         )
-        ui.html(f"<nav aria-label='Pages'><ol>{links}</ol></nav>", sanitize=False)
+        html(f"<nav aria-label='Pages'><ol>{links}</ol></nav>")
     drawer.build()
     with ui.element("main").props('id="main" tabindex="-1"').classes("page"):
-        ui.html(f"<h1>{escape(page.title)}</h1><p class=lead>{escape(page.about)}</p>", sanitize=False)
+        html(f"<h1>{escape(page.title)}</h1><p class=lead>{escape(page.about)}</p>")
         if not work.project.writable:
-            ui.html(f"<ul class=notes><li role=status>{READ_ONLY}</li></ul>", sanitize=False)
+            html(f"<ul class=notes><li role=status>{READ_ONLY}</li></ul>")
         guide(work, page, pages)
         yield
 
@@ -98,25 +97,20 @@ class JobsDrawer:
 
     def __init__(self, work: Workspace) -> None:
         self.work, self._state = work, ""
-        self.button = ui.button("Runs", icon="playlist_play", on_click=self.toggle)
-        self.button.props('flat no-caps aria-label="Runs" aria-expanded=false')
+        self.button = ui.button("Runs", icon="playlist_play", on_click=lambda: self.drawer.toggle())
+        self.button.props('flat aria-label="Runs" aria-expanded=false')
 
     def build(self) -> None:
         """Build the drawer beside the page."""
         with ui.right_drawer(value=False, bordered=True).props("width=380 overlay").classes("runs") as self.drawer:
             with ui.element("div").classes("drawer-head"):
-                ui.html("<h2>Runs</h2>", sanitize=False)
+                html("<h2>Runs</h2>")
                 ui.button(icon="close", on_click=self.drawer.hide).props('flat round dense aria-label="Close the runs"')
-            self._at_once = ui.number(
-                "At the same time", value=self.work.jobs.at_once, min=1, max=64, on_change=self._set
-            ).props("dense outlined")
+            at_once = self.work.jobs.at_once
+            self._at_once = ui.number("At the same time", value=at_once, min=1, max=64, on_change=self._set)
             self.place = ui.element("div").props('role="list" aria-label="Runs"')
         self.drawer.on_value_change(self._on_toggle)
         ui.timer(EVERY, self._refresh)
-
-    def toggle(self) -> None:
-        """Open or close the drawer."""
-        self.drawer.toggle()
 
     def _on_toggle(self) -> None:
         """Report the state to screen readers, also after a tap beside the drawer."""
@@ -127,47 +121,41 @@ class JobsDrawer:
             self.work.jobs.at_once = int(self._at_once.value or 1)
 
     async def _refresh(self) -> None:
-        jobs, progress = await self.work.in_thread(self._jobs)
-        open_ = sum(job.state in OPEN for job in jobs)
+        rows = await self.work.in_thread(lambda: [(job, *_progress(self.work, job)) for job in self.work.jobs.all()])
+        open_ = sum(job.state in OPEN for job, *_ in rows)
         self.button.set_text(f"Runs ({open_})" if open_ else "Runs")
-        state = repr([(j.id, j.state, j.request, j.place) for j in jobs]) + repr(progress)
-        if state == self._state:
+        if (state := repr(rows)) == self._state:
             return
         self._state = state
         self.place.clear()
         with self.place:
-            for job in jobs[:LIMIT]:
-                self._row(job, *progress[job.id])
-            if not jobs:
+            for row in rows[:LIMIT]:
+                self._row(*row)
+            if not rows:
                 text_html("No runs yet.", classes="note")
-
-    def _jobs(self) -> tuple[list[CommandRun], dict[str, tuple[float, str]]]:
-        """The runs, and the progress of each by its id."""
-        jobs = self.work.jobs.all()
-        return jobs, {job.id: _progress(self.work, job) for job in jobs}
 
     def _row(self, job: CommandRun, share: float, title: str) -> None:
         state = f"{job.state}, {job.request} requested" if job.state == "running" and job.request else job.state
         with ui.element("div").classes(f"run {job.state}").props('role="listitem"'):
-            ui.html(
-                f"<b>{escape(job.title)}</b><span class=state>{escape(state)} {escape(title)}</span>"
-                f"<code>{escape(job.line)}</code>", sanitize=False,
-            )  # fmt: skip
+            words = f"<b>{escape(job.title)}</b><span class=state>{escape(state)} {escape(title)}</span>"
+            html(f"{words}<code>{escape(job.line)}</code>")
             if job.state == "held":
                 text_html("Queued with an earlier server. Read its command line before you start it.", classes="note")
             if job.state == "running" and share:
                 ui.linear_progress(share, show_value=False).props["aria-label"] = job.title
             with ui.row().classes("gap-1"):
-                for action in ACTIONS[job.state]:
+                for action, name in ACTIONS[job.state].items():
                     if action != "pause" or job.resumable:
-                        name = "Cancel" if (action, job.state) == ("stop", "queued") else NAMES[action]
-                        button = ui.button(name, on_click=lambda a=action, i=job.id: self._do(a, i))
-                        button.props("flat dense no-caps").props["aria-label"] = f"{name}: {job.title}"
-                ui.button("Log", on_click=lambda i=job.id: self._log(i)).props("flat dense no-caps")
+                        button = ui.button(name, on_click=lambda a=action: self._do(a, job.id)).props("flat dense")
+                        button.props["aria-label"] = f"{name}: {job.title}"
+                ui.button("Log", on_click=lambda: self._log(job.id)).props("flat dense")
 
     async def _do(self, action: str, id: str) -> None:
         with refusals():
-            getattr(self.work.jobs, action)(id)
+            if action in MOVES:
+                self.work.jobs.move(id, MOVES[action])
+            else:
+                getattr(self.work.jobs, action)(id)
         await self._refresh()
 
     def _log(self, id: str) -> None:
@@ -177,7 +165,7 @@ class JobsDrawer:
             began = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(job.started)) if job.started else "not started"
             text_html(job.title, "h2")
             text_html(began, classes="note")
-            ui.html(f"<pre tabindex=0>{escape(text)}</pre>", sanitize=False)
+            html(f"<pre tabindex=0>{escape(text)}</pre>")
 
 
 def _progress(work: Workspace, job: CommandRun) -> tuple[float, str]:

@@ -8,11 +8,10 @@ from typing import Any
 
 from nicegui import ui
 
-from nerif.app.forms.elements import CommandLine, card, items_html, refusals, select, text_html
+from nerif.app.forms.elements import CommandLine, card, html, image, items_html, refusals, select, text_html
 from nerif.app.pages.page import Hint, Page
 from nerif.app.project.workspace import Workspace
 from nerif.app.views.crop_editor import SOURCES, CropCard
-from nerif.common.conventions import InputError
 from nerif.imaging.quality.image_quality import ImageQuality
 from nerif.imaging.readers.views import View
 
@@ -85,25 +84,22 @@ class ImagesPage:
         self.summary.clear()
         with self.summary:
             text_html(f"{len(self.views)} views. {'' if problems else 'No problems found.'}", classes="status")
-            ui.html(items_html(problems, label="What is wrong"), sanitize=False)
+            html(items_html(problems, label="What is wrong"))
 
     async def _cell(self, view: View, request: int) -> list[str]:
         """Fill the cell of a view and return its problems."""
         problems: list[str] = []
         qualities: dict[str, ImageQuality] = {}
         for source in SOURCES:
-            try:
+            with refusals(problems.append):
                 qualities[source] = await self.work.in_thread(self.work.files.quality, view, source)
-            except InputError as error:
-                problems.append(str(error))
         problems += [f"{name}: {why}" for quality in qualities.values() for name, why in quality.bad]
         problems += [note for quality in qualities.values() for note in quality.notes]
         images: dict[str, str] = {}
         for source, quality in qualities.items():
+            what = view, source, quality.first, THUMBNAIL, view.crop
             with refusals(problems.append):
-                images[source] = await self.work.in_thread(
-                    self.work.files.image, view, source, quality.first, THUMBNAIL, view.crop
-                )
+                images[source] = await self.work.in_thread(self.work.files.image, *what)
         if request != self._request:
             return problems
         cell = self.cells[view.name]
@@ -113,7 +109,7 @@ class ImagesPage:
             with ui.element("div").classes("pair"):
                 for source in SOURCES:
                     _figure(view, source, qualities.get(source), images.get(source, ""))
-            ui.html(items_html(problems), sanitize=False)
+            html(items_html(problems))
 
             async def choose() -> None:
                 self.crop.selection = view.name
@@ -122,7 +118,7 @@ class ImagesPage:
                 ui.run_javascript("document.querySelector('.crop-card')?.scrollIntoView({block: 'start'})")
 
             button = ui.button("Look closer, crop, turn", icon="crop_rotate", on_click=choose)
-            button.props("outline no-caps dense").props["aria-label"] = f"Look closer at {view.name}, crop or turn it"
+            button.props("outline dense").props["aria-label"] = f"Look closer at {view.name}, crop or turn it"
         return problems
 
 
@@ -133,16 +129,13 @@ def _figure(view: View, source: str, quality: ImageQuality | None, address: str)
         return
     height, width = quality.shape
     with ui.element("figure"):
-        image = ui.element("img").props("loading=lazy")
-        image.props["src"], image.props["alt"] = address, f"{source.capitalize()} of {view.name}"
+        image(address, f"{source.capitalize()} of {view.name}").props("loading=lazy")
         count = f"{quality.count}" if quality.sampled == quality.count else f"{quality.count} ({quality.sampled} read)"
         full = f"{quality.saturated:.2%} saturated" if quality.full > 1 else "saturation unknown"
         label = f"Grey values of {source} of {view.name}, {full}"
-        ui.html(
-            f"<figcaption><b>{source.capitalize()}</b>, {count}<br>{width} × {height} px, "
-            f"<span class=share>{full}</span></figcaption>"
-            + _histogram(quality.histogram.tolist(), quality.full, escape(label)), sanitize=False,
-        )  # fmt: skip
+        shape = f"{width} × {height} px, <span class=share>{full}</span>"
+        bars = _histogram(quality.histogram.tolist(), quality.full, escape(label))
+        html(f"<figcaption><b>{source.capitalize()}</b>, {count}<br>{shape}</figcaption>{bars}")
 
 
 def _histogram(shares: Sequence[float], full: float, label: str) -> str:
@@ -188,4 +181,4 @@ HINT = Hint(
     "The dots shift by less than a pixel: too little to see in one image, enough to measure. No pixel is "
     "saturated, and no problems are listed.",
 )
-PAGE = Page("images", "Images", "/images", ABOUT, build, HINT)
+PAGE = Page("images", "Images", ABOUT, build, HINT)

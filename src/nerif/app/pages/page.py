@@ -39,9 +39,8 @@ class Page:
 
     Parameters
     ----------
-    name : one word, the key of its draft
+    name : one word, its address and the key of its draft
     title : its heading
-    path : path of its address
     about : one sentence below the title
     build : builds it within the frame; a coroutine function where it waits for something
     hint : of the guide; None for a page that the guide passes over
@@ -49,7 +48,11 @@ class Page:
 
     name: str
     title: str
-    path: str
     about: str
     build: Callable[[Workspace], Awaitable[None] | None]
     hint: Hint | None = None
+
+    @property
+    def path(self) -> str:
+        """The path of its address."""
+        return f"/{self.name}"

@@ -10,7 +10,7 @@ from typing import Any
 
 from nicegui import ui
 
-from nerif.app.forms.elements import CommandLine, FileChoice, card, refusals, select, text_html
+from nerif.app.forms.elements import CommandLine, FileChoice, card, html, refusals, select, text_html
 from nerif.app.forms.form import Form
 from nerif.app.forms.form_view import FormView
 from nerif.app.pages.page import Hint, Page
@@ -35,6 +35,7 @@ WITHOUT = ("config", "measurement", "out", "method", "preset", "force", "resume"
 MAIN = ("time_limit", "withhold", "uncertainty", "voxels")
 FILM = ".zarr"
 EVERY = 1.0  # seconds
+NO_MEASUREMENT = "No measurement in this folder yet: nerif displacement or nerif simulate makes one."
 VALUES = {False: "values", True: "film_values"}  # key of the settings in the draft: of one instant, of a film
 FILM_WITHOUT = ("config", "measurement", "out", "preset", "force", "time_limit", "refine", "known")
 FILM_MAIN = ("cluster", "workers", "chunk", "withhold", "voxels")
@@ -69,26 +70,24 @@ class ReconstructPage:
     """The page in one tab."""
 
     def __init__(self, work: Workspace, measurements: Iterable[str]) -> None:
-        self.work = work
-        draft = work.draft(PAGE.name)
-        name = draft.get("measurement")
+        self.work, draft = work, work.draft(PAGE.name)
         self.values: dict[str, dict[str, Any]] = {name: dict(draft.get(name, {})) for name in VALUES.values()}
         with ui.element("div").classes("columns"):
             with card("A run"), ui.element("div").classes("form"):
-                text = "No measurement in this folder yet: nerif displacement or nerif simulate makes one."
-                note = text_html(text, classes="note")
+                note = text_html(NO_MEASUREMENT, classes="note")
+                name = draft.get("measurement")
                 self.measurement = FileChoice(
                     "Measurement", tuple(measurements), name, lambda: _measurements(work), self._on_choice
                 )
                 note.bind_visibility_from(self.measurement.select, "options", lambda names: not names)
                 self.method = self._select("Method", titles(), draft.get("method", "nerif"))
-                self.about = ui.html("", sanitize=False).classes("help")
+                self.about = html().classes("help")
                 self.preset = self._select("Preset", ["auto", *PRESETS], draft.get("preset", "auto"))
-                self.out = ui.input("Result directory", value=self._free_name()).props("outlined dense debounce=250")
+                self.out = ui.input("Result directory", value=self._free_name())
                 self.out.on_value_change(self._show)
                 self.place = ui.element("div").classes("form")
-                self.notes = ui.html("", sanitize=False).props('role=status aria-live="polite"')
-                self.start = ui.button("Start", icon="play_arrow", on_click=self._start).props("unelevated no-caps")
+                self.notes = html().props('role=status aria-live="polite"')
+                self.start = ui.button("Start", icon="play_arrow", on_click=self._start).props("unelevated")
             with ui.element("div").classes("stack"):
                 with card("The same on the command line"):
                     self.command = CommandLine()
@@ -125,20 +124,17 @@ class ReconstructPage:
 
     def _free_name(self) -> str:
         stem = PurePosixPath(self.measurement.name or "run").stem
-        occupied = [job.out for job in self.work.jobs.all()]
-        ending = FILM if self.film else f"-{self.method.value}"
-        return self.work.project.free_name(f"results/{stem}{ending}", occupied)
+        name = f"results/{stem}{FILM if self.film else f'-{self.method.value}'}"
+        return self.work.project.free_name(name, [job.out for job in self.work.jobs.all()])
 
     def _build_form(self) -> None:
-        form: Form[Any] = form_of(self.method.value, self.preset.value)
-        if self.film:
-            form = form_of_film(self.preset.value)
+        method, preset = self.method.value, self.preset.value
+        form: Form[Any] = form_of_film(preset) if self.film else form_of(method, preset)
         self.method.set_visibility(not self.film)
         self.about.set_visibility(not self.film)
-        self.about.set_content(f"<p>{escape(METHODS[self.method.value].about())}</p>")
-        self.preset.set_visibility(self.film or self.method.value == "nerif")
+        self.about.set_content(f"<p>{escape(METHODS[method].about())}</p>")
+        self.preset.set_visibility(self.film or method == "nerif")
         self.out.props["label"] = "Result (.zarr)" if self.film else "Result directory"
-        self.out.update()
         self.place.clear()
         names = {f.name for f in form.fields}
         main = [name for name in (FILM_MAIN if self.film else MAIN) if name in names]
@@ -187,17 +183,10 @@ async def _measurements(work: Workspace) -> tuple[str, ...]:
 
 
 def _has_measurements(work: Workspace, name: str) -> bool:
-    """Whether a store over time holds measurements."""
-
-    def read(path: Path) -> bool:
-        try:
-            return len(MeasurementSequence.read(path.parent)) > 0
-        except InputError:
-            return False
-
     try:
-        return work.project.from_cache(f"{name}/zarr.json", "measured", read)
-    except FileNotFoundError:  # just being made, or none of ours
+        read = work.project.from_cache
+        return read(f"{name}/zarr.json", "measured", lambda path: len(MeasurementSequence.read(path.parent)) > 0)
+    except (FileNotFoundError, InputError):  # just being made, or none of ours
         return False
 
 
@@ -216,4 +205,4 @@ HINT = Hint(
     },
     done=lambda work: any((work.project.folder / name / VOLUME).is_file() for name in work.project.contents().results),
 )
-PAGE = Page("reconstruct", "Reconstruct", "/reconstruct", ABOUT, build, HINT)
+PAGE = Page("reconstruct", "Reconstruct", ABOUT, build, HINT)

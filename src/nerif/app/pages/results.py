@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import PurePosixPath
 from typing import Any
 
 from nicegui import ui
 
-from nerif.app.forms.elements import CommandLine, card, figures, refusals, select, text_html
+from nerif.app.forms.elements import CommandLine, card, figures, html, refusals, select, text_field, text_html
 from nerif.app.forms.form import Form
 from nerif.app.forms.job_form import JobForm, JobStatus
 from nerif.app.pages.page import Hint, Page
@@ -26,6 +26,7 @@ from nerif.data.volume import FORMATS
 
 __all__ = ["PAGE"]
 
+VERBS: dict[type, str] = {Export: "export", Figures: "figures", MovieCommand: "movie"}
 TABS = {"slices": "Slices", "surface": "In 3-D", "report": "Report", "export": "Export"}
 PROGRAMS = {
     ".vti": "ParaView (.vti)", ".nc": "NetCDF (.nc)", ".npz": "NumPy (.npz)", ".mat": "MATLAB (.mat)",
@@ -73,22 +74,20 @@ class ResultsPage:
             await self._views()
 
     def _verdict(self) -> None:
-        row = self.row
-        with card(row.title):
-            text_html(row.sentence)
-            if row.figures:
-                ui.html(figures([(a, b, "") for a, b in row.figures]), sanitize=False)
+        with card(self.row.title):
+            text_html(self.row.sentence)
+            if self.row.figures:
+                html(figures([(a, b, "") for a, b in self.row.figures]))
 
     async def _views(self) -> None:
-        tab = str(self.draft.get("tab", "slices"))
         with ui.element("section").classes("card").props('aria-label="The result"'):
-            with ui.tabs().props("no-caps align=left dense") as tabs:
+            with ui.tabs().props("align=left dense") as tabs:
                 for name, title in TABS.items():
                     ui.tab(name, title)
             others = [r.name for r in self.rows if r.name != self.row.name and r.film == self.row.film]
             view = ResultView(self.work, self.row.name, others, self.draft, self.keep)
-            first = tab if tab in TABS else "slices"
-            with ui.tab_panels(tabs, value=first, animated=False).classes("panels-of-tabs") as panels:
+            tab = self.draft.get("tab") if self.draft.get("tab") in TABS else "slices"
+            with ui.tab_panels(tabs, value=tab, animated=False).classes("panels-of-tabs") as panels:
                 with ui.tab_panel("slices"):
                     await view.build()
                 with ui.tab_panel("surface"):
@@ -117,16 +116,13 @@ class ResultsPage:
         file = report_file(self.work.project.path(name))
         if file.is_file():
             address = report_address(name, file.stat().st_mtime_ns)
-            link = ui.link("Open the report alone", address, new_tab=True).classes("alone")
-            link.props["rel"] = "noopener"
+            ui.link("Open the report alone", address, new_tab=True).classes("alone").props("rel=noopener")
             frame = ui.element("iframe").classes("report").props('sandbox="allow-scripts allow-downloads" loading=lazy')
-            frame.props["src"] = address
-            frame.props["title"] = f"Report of {self.row.title}"
+            frame.props.update({"src": address, "title": f"Report of {self.row.title}"})
         else:
             text_html("There is no report yet.", classes="note")
         text_html("The same on the command line", "h3")
-        command = CommandLine()
-        command.show(["report", name])
+        CommandLine().show(["report", name])
 
         def write() -> None:
             with refusals():
@@ -137,7 +133,7 @@ class ResultsPage:
                 await self.build()
 
         button = "Write it again" if file.is_file() else "Write the report"
-        ui.button(button, icon="playlist_add", on_click=write).props("outline no-caps")
+        ui.button(button, icon="playlist_add", on_click=write).props("outline")
         status = JobStatus(self.work, f"{PAGE.name}.report {name}", on_end)
 
     # -- for others ----------------------------------------------------------------------------------------------
@@ -146,54 +142,40 @@ class ResultsPage:
         with ui.element("div").classes("halves"):
             if self.row.film:
                 with card("A movie", f"Every frame drawn off-screen; needs {install('movie')}."):
-                    self._movie()
+                    movie = MovieCommand(MISSING, MISSING)
+                    formats = {".mp4": "H.264 (.mp4)", ".gif": "GIF (.gif)"}
+                    self._file_form(movie, formats, "Make the movie", ("style", "every"))
                 return
             with card("The field, for other programs", "On any grid: a network has no voxels of its own."):
-                self._volume()
-            with card("Figures for print", "Vector PDF and PNG, as wide as the columns of a journal."):
-                self._figures()
+                formats = {ending: PROGRAMS.get(ending, ending) for ending in FORMATS}
+                self._file_form(Export(MISSING, MISSING), formats, "Export", ("voxels", "quantities"))
+            note = "Vector PDF and PNG, as wide as the columns of a journal."
+            with card("Figures for print", note), ui.element("div").classes("form"):
+                text_html(f"They are written to {self.row.title}/figures.", classes="note")
+                self._form(Figures(MISSING), lambda: ["figures", self.row.name], "Draw the figures")
 
-    def _file_form(
-        self, verb: str, form: Form[Any], formats: Mapping[str, str], button: str, main: Sequence[str]
-    ) -> None:
+    def _file_form(self, record: Any, formats: Mapping[str, str], button: str, main: Sequence[str]) -> None:
         """Build the form of a command that writes a file, with a choice of its format that changes its name."""
 
         def name_with(ending: str) -> str:
             return self.work.project.free_name(f"exports/{PurePosixPath(self.row.title).stem}{ending}")
 
-        first = next(iter(formats))
+        def words() -> list[str]:
+            return [VERBS[type(record)], self.row.name, "-o", word_of(name.value or "FILE")]
+
         with ui.element("div").classes("form"):
-            choice = select("Format", dict(formats), first)
-            name = ui.input("File to write", value=name_with(first)).props("outlined dense debounce=250")
-            name.props["aria-label"] = "File to write"
-            job_form = JobForm(
-                self.work, f"{PAGE.name}.{verb}", form,
-                lambda: [verb, self.row.name, "-o", word_of(name.value or "FILE")], button, main, lambda: name.value,
-                subject=self.row.name,
-            )  # fmt: skip
+            choice = select("Format", dict(formats))
+            name = text_field("File to write", name_with(choice.value))
+            job_form = self._form(record, words, button, main, lambda: name.value)
         choice.on_value_change(lambda: name.set_value(name_with(choice.value)))
         name.on_value_change(job_form.show)
 
-    def _volume(self) -> None:
-        form = Form(Export(MISSING, MISSING), without=("config", "result", "out", "force"))
-        formats = {ending: PROGRAMS.get(ending, ending) for ending in FORMATS}
-        self._file_form("export", form, formats, "Export", ("voxels", "quantities"))
-
-    def _figures(self) -> None:
-        record = Figures(MISSING)
-        form = Form(record, without=("config", "result", "out"))
-        with ui.element("div").classes("form"):
-            text_html(f"They are written to {self.row.title}/figures.", classes="note")
-            JobForm(
-                self.work, f"{PAGE.name}.figures", form, lambda: ["figures", self.row.name], "Draw the figures",
-                subject=self.row.name,
-            )  # fmt: skip
-
-    def _movie(self) -> None:
-        record = MovieCommand(MISSING, MISSING)
-        form = Form(record, without=("config", "result", "out", "force"))
-        formats = {".mp4": "H.264 (.mp4)", ".gif": "GIF (.gif)"}
-        self._file_form("movie", form, formats, "Make the movie", ("style", "every"))
+    def _form(
+        self, record: Any, words: Callable[[], list[str]], button: str, main: Sequence[str] = (),
+        out: Callable[[], str] | None = None,
+    ) -> JobForm:  # fmt: skip
+        form, name = Form(record, without=("config", "result", "out", "force")), f"{PAGE.name}.{VERBS[type(record)]}"
+        return JobForm(self.work, name, form, words, button, main, out, subject=self.row.name)
 
 
 async def build(work: Workspace) -> None:
@@ -210,4 +192,4 @@ HINT = Hint(
     "withheld view also estimates the error.",
     before="reconstruct",
 )
-PAGE = Page("results", "Results", "/results", ABOUT, build, HINT)
+PAGE = Page("results", "Results", ABOUT, build, HINT)

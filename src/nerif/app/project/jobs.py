@@ -88,8 +88,8 @@ class CommandRun:
         return self.arguments[0] in RESUMABLE and bool(self.out)
 
 
-ENTRIES: dict[str, type | tuple[type, ...]] = {
-    "id": str, "title": str, "arguments": list, "attempt": list, "out": str, "request": str, "place": (int, float),
+ENTRIES: dict[str, Any] = {
+    "id": str, "title": str, "arguments": list, "attempt": list, "out": str, "request": str, "place": int | float,
 }  # fmt: skip
 
 
@@ -152,8 +152,8 @@ class Jobs:
                 over = "stopped"
             return replace(job, state=over if job.request or not job.code else "failed")
         if started:
-            job = replace(job, started=started["time"], pid=int(started["pid"]))
-            if began(job.pid) == str(started["began"]) or _is_alive(self._own.get(name)):
+            job, process = replace(job, started=started["time"], pid=int(started["pid"])), self._own.get(name)
+            if began(job.pid) == str(started["began"]) or (process is not None and process.poll() is None):
                 return replace(job, state="running")
             return replace(job, state="stopped" if job.request else "failed", ended=(where / STARTED).stat().st_mtime)
         if job.request:
@@ -173,8 +173,6 @@ class Jobs:
         title : title for display
         out : result directory, relative to the folder
         """
-        if not arguments:
-            raise InputError("expected a command of nerif, got nothing", field="arguments")
         name = f"{time.strftime('%Y%m%d-%H%M%S')}-{secrets.token_hex(3)}"
         words = tuple(str(word) for word in arguments)
         job = CommandRun(name, title, words, words, str(out), place=time.time())
@@ -215,27 +213,17 @@ class Jobs:
         for name in (STARTED, ENDED):  # the run is queued once both are removed
             (self._of(job) / name).unlink(missing_ok=True)
 
-    def first(self, id: str) -> None:
-        """Move a queued run to the front."""
-        job = self.get(id)
-        self._write(replace(job, place=min((j.place for j in self.all()), default=0.0) - 1))
-
-    def earlier(self, id: str) -> None:
-        """Swap a queued run with the one before it."""
-        self._swap(id, -1)
-
-    def later(self, id: str) -> None:
-        """Swap a queued run with the one after it."""
-        self._swap(id, 1)
-
-    def _swap(self, id: str, by: int) -> None:
+    def move(self, id: str, by: int) -> None:
+        """Move a queued run by some places, at most to an end of the queue."""
         queue = [job for job in self.all() if job.state == "queued"]
         at = next((i for i, job in enumerate(queue) if job.id == id), None)
-        if at is None or not 0 <= at + by < len(queue):
+        if at is None:
             return
-        job, other = queue[at], queue[at + by]
-        self._write(replace(job, place=other.place))
-        self._write(replace(other, place=job.place))
+        places = [job.place for job in queue]
+        queue.insert(max(at + by, 0), queue.pop(at))
+        for job, place in zip(queue, places, strict=True):
+            if job.place != place:
+                self._write(replace(job, place=place))
 
     def remove(self, id: str) -> None:
         """Remove a run from the list, not its output; InputError while it runs."""
@@ -299,10 +287,6 @@ def _is_job(entries: Mapping[str, Any]) -> bool:
     if set(entries) != set(ENTRIES) or not all(isinstance(entries[name], kind) for name, kind in ENTRIES.items()):
         return False
     return all(words and all(isinstance(w, str) for w in words) for words in (entries["arguments"], entries["attempt"]))
-
-
-def _is_alive(process: subprocess.Popen[bytes] | None) -> bool:
-    return process is not None and process.poll() is None
 
 
 def _json(path: Path) -> dict[str, Any]:

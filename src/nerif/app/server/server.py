@@ -36,6 +36,10 @@ PORTS = 20  # that are tried
 LOCAL = ("127.0.0.1", "localhost", "[::1]")
 EVERYWHERE = ("0.0.0.0", "::")
 QUEUE_EVERY = 0.5  # seconds
+FAVICON = (
+    '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 32 32"><rect width="32" height="32" rx="6" fill="#0b5a9c"/>'
+    '<path d="M6 22c5-12 8 6 13-6 2-4 4-6 7-6" fill="none" stroke="#fff" stroke-width="3"/></svg>'
+)
 
 
 @dataclass(frozen=True)
@@ -58,9 +62,7 @@ class Address:
     root: str = ""
 
     @classmethod
-    def of(
-        cls, host: str, port: int, token: str | None, allowed: tuple[str, ...] = (), root: str = ""
-    ) -> Address:  # fmt: skip
+    def of(cls, host: str, port: int, token: str | None, allowed: tuple[str, ...] = (), root: str = "") -> Address:
         """Return an address with a free port; a host that others can reach needs a token, else it is random."""
         if not _is_local(host):
             if token is None:
@@ -108,7 +110,8 @@ def serve(folder: Path, address: Address, browser: bool = True) -> None:
         Guard, token=address.token, hosts=address.names, port=address.port, allowed=address.allowed,
         root=address.root, say=say,
     )  # fmt: skip
-    first_path = _first(work.project).path[1 if address.root else 0 :]  # a proxy changes absolute ones
+    first_page = "results" if work.project.is_result else PAGES[0].name
+    first_path = f"{'' if address.root else '/'}{first_page}"  # a proxy changes absolute ones
     app.add_api_route("/", lambda: RedirectResponse(first_path), include_in_schema=False)
     for path, handler in routes(work).items():
         app.add_api_route(path, handler, include_in_schema=False)
@@ -141,12 +144,6 @@ def serve(folder: Path, address: Address, browser: bool = True) -> None:
     say("The server has ended; start nerif app to see its runs again.")
 
 
-FAVICON = (
-    '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 32 32"><rect width="32" height="32" rx="6" fill="#0b5a9c"/>'
-    '<path d="M6 22c5-12 8 6 13-6 2-4 4-6 7-6" fill="none" stroke="#fff" stroke-width="3"/></svg>'
-)
-
-
 def is_relevant(record: logging.LogRecord) -> bool:
     """Whether a record of the server's log is written: not for a request that the browser has cancelled.
 
@@ -156,14 +153,7 @@ def is_relevant(record: logging.LogRecord) -> bool:
     return not (isinstance(error, RuntimeError) and str(error) == "No response returned.")
 
 
-def _first(project: ProjectFolder) -> Page:
-    """The page that opens first: Results for a result directory."""
-    return next(page for page in PAGES if page.name == "results") if project.is_result else PAGES[0]
-
-
 def _handler(work: Workspace, page: Page) -> Callable[[], Awaitable[None]]:
-    """The handler that builds a page within the frame."""
-
     async def build() -> None:
         with frame(work, page, PAGES):
             try:

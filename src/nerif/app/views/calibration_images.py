@@ -7,7 +7,7 @@ from html import escape
 
 from nicegui import ui
 
-from nerif.app.forms.elements import text_html
+from nerif.app.forms.elements import html, text_html
 from nerif.app.project.workspace import Workspace
 from nerif.common.conventions import InputError
 from nerif.imaging.calibration.result import ImageError
@@ -31,7 +31,7 @@ class CalibrationImages:
     """
 
     def __init__(self, work: Workspace, on_toggle: Callable[[str], None]) -> None:
-        self.work, self.files, self._on_toggle = work, work.files, on_toggle
+        self.work, self._on_toggle = work, on_toggle
         self._request = 0
         self._place = ui.element("div").classes("stack")
 
@@ -46,107 +46,97 @@ class CalibrationImages:
         view : view of an experiment
         targets : targets in space and on the background
         errors : errors by the name of the image
-        exclusions : names of images
+        exclusions : names of images, which `on_toggle` changes
         """
         self._request += 1
         request = self._request
         self._place.clear()
         for source, title in SOURCES.items():
-            if source not in view.sources:
-                with self._place:
-                    text_html(f"{title}: there is no {view.name}/{source}.", classes="note")
-                continue
+            with self._place:
+                section = ui.element("div")
             try:
+                if source not in view.sources:
+                    raise InputError(f"{title}: there is no {view.name}/{source}.")
                 names = await self.work.in_thread(_poses, view, source)
             except InputError as error:
-                with self._place:
+                with section:
                     text_html(str(error), classes="note")
                 continue
             if request != self._request:
                 return
-            with self._place, ui.element("div"):
+            with section:
                 text_html(title, "h3")
                 note, grid = ui.element("div"), ui.element("div").classes("targets")
             missing = []
             for number, pose in enumerate(names):
-                name = f"{view.name}/{source}/{pose}"
                 try:
-                    address = await self.work.in_thread(self.files.image, view, source, number, LARGEST, view.crop)
-                    detection = await self.work.in_thread(self.files.detection, view, source, number, targets[source])
-                    shape = await self.work.in_thread(self._shape, view, source)
+                    shot = await self.work.in_thread(self._read, view, source, number, targets[source])
                 except InputError as error:
                     with grid:
                         text_html(str(error), classes="missing note")
                     continue
                 if request != self._request:
                     return
-                if detection is None:
+                if shot[1] is None:
                     missing.append(number)
                 with grid:
-                    self._cell(name, address, detection, shape, errors, name in exclusions)
+                    self._cell(f"{view.name}/{source}/{pose}", *shot, errors, exclusions)
             if missing and few_detections(len(names) - len(missing), len(names)):
-                text = await self.work.in_thread(self.files.explanation, view, source, missing, targets[source])
+                explain = self.work.files.explanation
+                text = await self.work.in_thread(explain, view, source, missing, targets[source])
                 if request != self._request:
                     return
                 with note:
                     text_html(f"No {targets[source].label} found: {text}.", classes="note")
 
-    def _shape(self, view: View, source: str) -> tuple[int, int]:
-        shape = view.open(source).shape
-        return view.crop.shape_of(shape) if view.crop else shape
+    def _read(
+        self, view: View, source: str, number: int, target: CalibrationTarget
+    ) -> tuple[str, Detection | None, tuple[int, int]]:
+        """Return the address of an image, its target, and its shape."""
+        address = self.work.files.image(view, source, number, LARGEST, view.crop)
+        detection, shape = self.work.files.detection(view, source, number, target), view.open(source).shape
+        return address, detection, view.crop.shape_of(shape) if view.crop else shape
 
     def _cell(
         self, name: str, address: str, detection: Detection | None, shape: tuple[int, int],
-        errors: Mapping[str, ImageError], exclusion: bool,
+        errors: Mapping[str, ImageError], exclusions: Collection[str],
     ) -> None:  # fmt: skip
-        with ui.element("div").classes("target left-out" if exclusion else "target") as cell:
-            error = _error_html(errors.get(name)) or (", not used" if errors and detection is not None else "")
-            count = "no target found" if detection is None else f"{len(detection.points)} points found"
-            with ui.element("figure"):
-                ui.html(
-                    f'<span class=shot><img src="{address}" alt="{escape(f"{name}, {count}")}">'
-                    f"{_marks(detection, shape)}</span><figcaption><b>{escape(name)}</b><br>{count}{error}"
-                    "</figcaption>", sanitize=False,
-                )  # fmt: skip
+        count, error, marks = "no target found", "", ""
+        if detection is not None:
+            count, marks = f"{len(detection.points)} points found", _marks(detection, shape)
+            error = ", not used" if errors else ""
+        if found := errors.get(name):
+            error = f", rms <b>{found.rms:.3f} px</b>{'' if found.used else ', did not fit'}"
+        with ui.element("div").classes("target") as cell:
+            picture = f'<img src="{address}" alt="{escape(f"{name}, {count}")}">'
+            caption = f"<figcaption><b>{escape(name)}</b><br>{count}{error}</figcaption>"
+            html(f"<span class=shot>{picture}{marks}</span>{caption}", "figure")
             if detection is None:
                 return
-            state = [exclusion]
-            button = ui.button().props("outline no-caps dense")
+            button = ui.button().props("outline dense")
 
-            def update() -> None:
-                text = "Include" if state[0] else "Exclude"
-                button.set_text(text)
-                button.props["aria-label"] = f"{text}: {name}"
-                button.props["aria-pressed"] = "true" if state[0] else "false"
-                button.update()
-                cell.classes(replace="target left-out" if state[0] else "target")
+        def update() -> None:
+            text, pressed = ("Include", "true") if name in exclusions else ("Exclude", "false")
+            button.set_text(text)
+            button.props.update({"aria-label": f"{text}: {name}", "aria-pressed": pressed})
+            cell.classes(replace="target left-out" if name in exclusions else "target")
 
-            def toggle() -> None:
-                state[0] = not state[0]
-                update()
-                self._on_toggle(name)
-
-            button.on_click(toggle)
+        def toggle() -> None:
+            self._on_toggle(name)
             update()
+
+        button.on_click(toggle)
+        update()
 
 
 def _poses(view: View, source: str) -> list[str]:
     return pose_names(view.open(source))
 
 
-def _error_html(error: ImageError | None) -> str:
-    if error is None:
-        return ""
-    return f", rms <b>{error.rms:.3f} px</b>{'' if error.used else ', did not fit'}"
-
-
-def _marks(detection: Detection | None, shape: tuple[int, int]) -> str:
+def _marks(detection: Detection, shape: tuple[int, int]) -> str:
     """Circles at the detected points as SVG, the first one filled."""
-    if detection is None:
-        return ""
     height, width = shape
-    radius = 0.012 * max(shape)
-    first = int(detection.ids.argmin())
+    radius, first = 0.012 * max(shape), int(detection.ids.argmin())
     circles = "".join(
         f"<circle{' class=first' if i == first else ''} cx={u + 0.5:.2f} cy={v + 0.5:.2f} r={radius:.2f} />"
         for i, (u, v) in enumerate(detection.pixels)

@@ -9,7 +9,7 @@ from typing import Any
 
 from nicegui import ui
 
-from nerif.app.forms.elements import card, refusals, select, text_html
+from nerif.app.forms.elements import card, html, image, refusals, select, text_html
 from nerif.app.project.workspace import Workspace
 from nerif.app.views.edits import Edits, UndoButtons
 from nerif.imaging.readers.crop import Crop
@@ -64,7 +64,7 @@ class CropCard:
         self.work, self._on_change, self._on_save = work, on_change, on_save
         self._request = 0
         self._first: dict[str, int] = {}
-        self._editor: CropEditor | None = None
+        self._shape = (0, 0)  # height and width of the frames of the selected view, px
         self._place = ui.element("div").classes("crop-card")
         self.load("", {}, {}, "")
 
@@ -82,27 +82,31 @@ class CropCard:
         self.edits = Edits({name: view.crop or Crop() for name, view in views.items()}, lambda c: Crop(**c), draft)
         self.selection = selection if selection in views else next(iter(views), "")
 
+    @property
+    def crop(self) -> Crop:
+        """The crop of the selected view."""
+        return self.edits.now[self.selection]
+
     async def show(self) -> None:
         """Show the selected view."""
         self._request += 1
         request, view = self._request, self.views.get(self.selection)
         self._place.clear()
-        self._editor = None
         if view is None:
             return
         messages: list[str] = []
         first: dict[str, int] = {}
-        frame, address = (0, 0), ""
+        shape, address = (0, 0), ""
         for source in SOURCES:
             with refusals(messages.append):
                 quality = await self.work.in_thread(self.work.files.quality, view, source)
                 first[source] = quality.first
                 if not address:
                     address = await self.work.in_thread(self.work.files.image, view, source, quality.first, LARGE, None)
-                    frame = quality.frame_shape
+                    shape = quality.frame_shape
         if request != self._request:  # another view has been selected meanwhile
             return
-        self._first = first
+        self._first, self._shape = first, shape
         with self._place, card(view.name, "Drag over the whole frame to crop it, or type; the result is on the right."):
             if not address:
                 text_html("There is no image to show: " + " ".join(messages), classes="note")
@@ -110,51 +114,105 @@ class CropCard:
             with ui.element("div").classes("halves wide"):
                 with ui.element("div"):
                     text_html("Whole frame", "h3")
-                    self._editor = CropEditor(view.name, frame, self.edits.now[view.name], address, self._edit)
+                    self._build_editor(view.name, address)
                 with ui.element("div"):
                     text_html("Reference and flow as they are used", "h3")
-                    self._blink = Blink(view.name)
-            self._buttons()
-        await self._show_result()
+                    self._images = blinking_images(view.name)
+            with ui.element("div").classes("side-by-side"):
+                self._undo = UndoButtons(self.edits, self._step)
+                ui.button("Whole frame", icon="crop_free", on_click=lambda: self._edit(Crop())).props("outline dense")
+                ui.button("The same for all views", icon="content_copy", on_click=self._for_all).props("outline dense")
+                self._save_button = ui.button("Save to views.toml", icon="save", on_click=self._save)
+                self._save_button.props("unelevated dense")
+            self._state = html()
+        await self._show_crop()
 
-    def _buttons(self) -> None:
-        with ui.element("div").classes("side-by-side"):
-            self._undo = UndoButtons(self.edits, self._step)
-            for text, icon, action in (
-                ("Whole frame", "crop_free", self._reset), ("The same for all views", "content_copy", self._for_all),
-            ):  # fmt: skip
-                ui.button(text, icon=icon, on_click=action).props("outline no-caps dense")
-            self._save_button = ui.button("Save to views.toml", icon="save", on_click=self._save)
-            self._save_button.props("unelevated no-caps dense")
-        self._state = ui.html("", sanitize=False)
+    # -- the editor ----------------------------------------------------------------------------------------------
+
+    def _build_editor(self, name: str, address: str) -> None:
+        height, width = self._shape
+        with ui.element("div").classes("cropper").on("pointerdown", self._on_drag, js_handler=DRAG) as place:
+            place.style(f"aspect-ratio: {width / height:.4f}; --aspect: {width / height:.4f}")
+            image(address, f"Whole frame of {name}").props("draggable=false")
+            self._mark = ui.element("div").classes("mark")
+        self._controls: dict[str, Any] = {}
+        with ui.element("div").classes("numbers"):
+            for key, text in NUMBERS.items():
+                control = ui.number(text, min=0 if key in ("row", "column") else 1, step=1, suffix="px")
+                control.props.update({"name": key, "aria-label": f"{text} (px)"})
+                self._controls[key] = control
+            self._controls |= {"flip": select("Flip", FLIPS), "rotate": select("Rotate", TURNS)}
+        self._error = html().classes("error")
+        self._show_controls()
+        for key, control in self._controls.items():
+            control.on_value_change(lambda event, key=key: self._on_control(key, event.value))
+
+    def _value(self, key: str) -> Any:
+        """Return the value of a control: a crop size of 0 reaches to the edge."""
+        whole = {"width": self._shape[1] - self.crop.column, "height": self._shape[0] - self.crop.row}
+        return getattr(self.crop, key) or whole.get(key, getattr(self.crop, key))
+
+    def _show_controls(self) -> None:
+        """Show the crop in the controls and over the frame."""
+        self._error.set_content("")
+        for key, control in self._controls.items():
+            control.set_value(self._value(key))
+        left, top, width, height = (
+            100 * self._value(key) / self._shape[key in ("column", "width")]
+            for key in ("column", "row", "width", "height")
+        )
+        self._mark.style(replace=f"left: {left:.3f}%; top: {top:.3f}%; width: {width:.3f}%; height: {height:.3f}%")
+        self._mark.update()
+
+    async def _on_control(self, key: str, value: Any) -> None:
+        if value is not None and value != self._value(key):
+            await self._change(**{key: value if key == "flip" else int(value)})
+
+    async def _on_drag(self, event: Any) -> None:
+        height, width = self._shape
+        left, top, right, bottom = event.args
+        column, row = round(left * width), round(top * height)
+        size = {"width": round(right * width) - column, "height": round(bottom * height) - row}
+        if min(size.values()) < LEAST:
+            self._show_controls()
+        else:
+            await self._change(row=row, column=column, **size)
+
+    async def _change(self, **values: Any) -> None:
+        """Change the crop if it is valid, or show the error."""
+        errors: list[str] = []
+        with refusals(errors.append):
+            crop = replace(self.crop, **values)
+            crop.shape_of(self._shape)
+        if errors:
+            text = errors[0].removeprefix("crop: ")
+            self._error.set_content(f"<span role=alert>{escape(text[:1].upper() + text[1:])}</span>")
+        else:
+            await self._edit(crop)
+
+    # -- edits ---------------------------------------------------------------------------------------------------
 
     async def _edit(self, crop: Crop) -> None:
         self.edits.put(self.selection, crop)
-        await self._show_result()
-
-    async def _reset(self) -> None:
-        await self._edit(Crop())
-        if self._editor:
-            self._editor.put(Crop())
+        await self._show_crop()
 
     async def _for_all(self) -> None:
         for name in self.views:
-            self.edits.put(name, self.edits.now[self.selection])
-        await self._show_result()
+            self.edits.put(name, self.crop)
+        await self._show_crop()
 
     async def _step(self, view: str) -> None:
         if view != self.selection:
             self.selection = view
             await self.show()
-            return
-        if self._editor:
-            self._editor.put(self.edits.now[view])
-        await self._show_result()
+        else:
+            await self._show_crop()
 
-    async def _show_result(self) -> None:
-        """Show the images as they are cropped, and which crops are not in the folder yet."""
+    async def _show_crop(self) -> None:
+        """Show the crop, the images as they are cropped, and which crops are not in the folder yet."""
         self._on_change()
-        view, crop = self.views[self.selection], self.edits.now[self.selection]
+        self._show_controls()
+        view, crop = self.views[self.selection], self.crop
         changes = self.edits.changes
         self._undo.show()
         self._save_button.set_enabled(bool(changes))
@@ -168,8 +226,8 @@ class CropCard:
             with refusals():
                 addresses[source] = await self.work.in_thread(self.work.files.image, view, source, first, LARGE, crop)
         if addresses and (view, crop) == (self.views.get(self.selection), self.edits.now.get(self.selection)):
-            one = next(iter(addresses.values()))
-            self._blink.show(addresses.get("reference", one), addresses.get("flow", one))
+            for source, element in self._images.items():
+                element.props["src"] = addresses.get(source, next(iter(addresses.values())))
 
     async def _save(self) -> None:
         with refusals():
@@ -179,133 +237,17 @@ class CropCard:
             await self._on_save()
 
 
-class CropEditor:
-    """Controls of one view's crop, added to the page under construction.
-
-    Parameters
-    ----------
-    name : name of the view
-    shape : (height, width) of its frames, px
-    crop : initial crop
-    address : address of the image of the whole frame
-    on_change : called with the new crop
-    """
-
-    def __init__(
-        self, name: str, shape: tuple[int, int], crop: Crop, address: str, on_change: Callable[[Crop], Awaitable[None]]
-    ) -> None:
-        self.shape, self.crop, self._on_change = shape, crop, on_change
-        height, width = shape
-        with ui.element("div").classes("cropper").on("pointerdown", self._on_drag, js_handler=DRAG) as place:
-            place.style(f"aspect-ratio: {width / height:.4f}; --aspect: {width / height:.4f}")
-            image = ui.element("img").props("draggable=false")
-            image.props["src"], image.props["alt"] = address, f"Whole frame of {name}"
-            self._mark = ui.element("div").classes("mark")
-        with ui.element("div").classes("numbers"):
-            self._numbers = {key: self._number(key, text) for key, text in NUMBERS.items()}
-            self._flip = self._choice("Flip", FLIPS, "flip")
-            self._rotate = self._choice("Rotate", TURNS, "rotate")
-        self._error = ui.html("", sanitize=False).classes("error")
-        self._show()
-
-    def _number(self, key: str, text: str) -> ui.number:
-        low = 0 if key in ("row", "column") else 1
-        control = ui.number(text, value=0, min=low, step=1, suffix="px").props("outlined dense debounce=250")
-        control.props["name"], control.props["aria-label"] = key, f"{text} (px)"
-
-        async def update() -> None:
-            value = control.value
-            if value is None or int(value) == self._value(key):
-                return
-            await self._put(**{key: int(value)})
-
-        return control.on_value_change(update)
-
-    def _choice(self, label: str, options: dict[Any, str], key: str) -> ui.select:
-        control = select(label, options, getattr(self.crop, key))
-
-        async def update() -> None:
-            if control.value != getattr(self.crop, key):
-                await self._put(**{key: control.value})
-
-        return control.on_value_change(update)
-
-    def _value(self, key: str) -> int:
-        """Return the value of a number control: a crop size of 0 reaches to the edge."""
-        value = int(getattr(self.crop, key))
-        whole = {"width": self.shape[1] - self.crop.column, "height": self.shape[0] - self.crop.row}
-        return value or whole.get(key, 0)
-
-    async def _on_drag(self, event: Any) -> None:
-        height, width = self.shape
-        left, top, right, bottom = event.args
-        column, row = round(left * width), round(top * height)
-        size = {"width": round(right * width) - column, "height": round(bottom * height) - row}
-        if min(size.values()) < LEAST:
-            self._show()
-            return
-        await self._put(row=row, column=column, **size)
-
-    async def _put(self, **values: Any) -> None:
-        """Change the crop if it is valid, or show the error."""
-        errors: list[str] = []
-        with refusals(errors.append):
-            crop = replace(self.crop, **values)
-            crop.shape_of(self.shape)
-            self.crop = crop
-        self._error.set_content("")
-        if errors:
-            text = errors[0].removeprefix("crop: ")
-            self._error.set_content(f"<span role=alert>{escape(text[:1].upper() + text[1:])}</span>")
-            return
-        self._show()
-        await self._on_change(self.crop)
-
-    def put(self, crop: Crop) -> None:
-        """Show another crop."""
-        self.crop = crop
-        self._error.set_content("")
-        self._show()
-
-    def _show(self) -> None:
-        for key, control in self._numbers.items():
-            control.set_value(self._value(key))
-        self._flip.set_value(self.crop.flip)
-        self._rotate.set_value(self.crop.rotate)
-        height, width = self.shape
-        self._mark.style(
-            replace=f"left: {100 * self.crop.column / width:.3f}%; top: {100 * self.crop.row / height:.3f}%; "
-            f"width: {100 * self._value('width') / width:.3f}%; height: {100 * self._value('height') / height:.3f}%"
-        )
-        self._mark.update()
-
-
-class Blink:
-    """Two images in one place, added to the page under construction.
-
-    Parameters
-    ----------
-    name : name of the view
-    """
-
-    def __init__(self, name: str) -> None:
-        self._name = name
-        with ui.element("div").classes("blink"):
-            with ui.element("div").classes("both") as both:
-                both.props["aria-label"] = f"Reference and flow of {name}; the space key changes between them"
-                both.props("tabindex=0 role=group").on("keydown", js_handler=SPACE)
-                self._images = [ui.element("img").classes(source) for source in SOURCES]
-            with ui.element("div").classes("side-by-side"):
-                ui.html("<b class=current aria-live=polite>Reference</b>", sanitize=False)
-                change = ui.button("Change", icon="swap_horiz").props("outline no-caps dense")
-                change.on("click", js_handler=CLICK)
-                clock = ui.button("Blink", icon="timer").props("outline no-caps dense aria-pressed=false")
-                clock.on("click", js_handler=CLOCK)
-                ui.html("<span class='calm note' role=status></span>", sanitize=False)
-
-    def show(self, reference: str, flow: str) -> None:
-        """Show two images by their addresses."""
-        for image, address, source in zip(self._images, (reference, flow), SOURCES, strict=True):
-            image.props["src"] = address
-            image.props["alt"] = f"{source.capitalize()} of {self._name}"
-            image.update()
+def blinking_images(name: str) -> dict[str, ui.element]:
+    """Build reference and flow of a view in one place, and what changes between them; return them by source."""
+    with ui.element("div").classes("blink"):
+        with ui.element("div").classes("both").props("tabindex=0 role=group").on("keydown", js_handler=SPACE) as both:
+            both.props["aria-label"] = f"Reference and flow of {name}; the space key changes between them"
+            images = {source: image(text=f"{source.capitalize()} of {name}").classes(source) for source in SOURCES}
+        with ui.element("div").classes("side-by-side"):
+            html("<b class=current aria-live=polite>Reference</b>")
+            change = ui.button("Change", icon="swap_horiz").props("outline dense")
+            change.on("click", js_handler=CLICK)
+            clock = ui.button("Blink", icon="timer").props("outline dense aria-pressed=false")
+            clock.on("click", js_handler=CLOCK)
+            html("<span class='calm note' role=status></span>")
+    return images

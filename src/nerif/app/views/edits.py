@@ -52,15 +52,9 @@ class Edits(Generic[T]):
         self.future = []
         self.now[name] = value
 
-    def undo(self) -> str:
-        """Undo the last step and return its view, empty if there is none."""
-        return self._step(self.past, self.future)
-
-    def redo(self) -> str:
-        """Repeat the last step that was undone and return its view, empty if there is none."""
-        return self._step(self.future, self.past)
-
-    def _step(self, origin: list[tuple[str, T]], target: list[tuple[str, T]]) -> str:
+    def step(self, back: bool) -> str:
+        """Undo the last step, or repeat the last one that was undone, and return its view; empty if there is none."""
+        origin, target = (self.past, self.future) if back else (self.future, self.past)
         if not origin:
             return ""
         name, value = origin.pop()
@@ -80,21 +74,13 @@ class UndoButtons:
 
     def __init__(self, edits: Edits[Any], on_step: Callable[[str], Awaitable[None] | None]) -> None:
         self._edits, self._on_step = edits, on_step
-        self._undo = ui.button("Undo", icon="undo", on_click=lambda: self.undo())
-        self._redo = ui.button("Redo", icon="redo", on_click=lambda: self.redo())
-        for button in (self._undo, self._redo):
-            button.props("outline no-caps dense")
+        self._undo = ui.button("Undo", icon="undo", on_click=lambda: self.step(True)).props("outline dense")
+        self._redo = ui.button("Redo", icon="redo", on_click=lambda: self.step(False)).props("outline dense")
         self.show()
 
-    def undo(self) -> Awaitable[None] | None:
-        """Undo the last step, as by the button."""
-        return self._report(self._edits.undo())
-
-    def redo(self) -> Awaitable[None] | None:
-        """Repeat the last step that was undone, as by the button."""
-        return self._report(self._edits.redo())
-
-    def _report(self, view: str) -> Awaitable[None] | None:
+    def step(self, back: bool) -> Awaitable[None] | None:
+        """Undo or redo a step, as by the button."""
+        view = self._edits.step(back)
         return self._on_step(view) if view else None
 
     def show(self) -> None:

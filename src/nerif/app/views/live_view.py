@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from nicegui import ui
 
-from nerif.app.forms.elements import images_html, refusals, select
+from nerif.app.forms.elements import card, html, images_html, refusals, select
 from nerif.app.project.jobs import CommandRun
 from nerif.app.project.workspace import Workspace
 from nerif.app.views.result_volumes import film_progress
@@ -29,11 +29,14 @@ __all__ = ["LiveView", "curve_options", "snapshot_html", "status_html"]
 
 EVERY = 1.0  # seconds
 CURVES = ("loss", "residual", "residual_over_sigma", "fit_loss")
-STATES = {"pause": ("running",), "stop": ("running", "queued"), "resume": ("paused", "stopped", "failed")}
 GREY, COLOURS = "#76838f", ["#2f86c9", "#d9721f"]  # visible on light and dark
 GRID: dict[str, Any] = {"axisLabel": {"color": GREY}, "nameTextStyle": {"color": GREY}}
 GRID["splitLine"] = {"lineStyle": {"color": "#76838f55"}}
-BUTTONS = {"pause": ("Pause", "pause"), "stop": ("Stop", "stop"), "resume": ("Go on", "play_arrow")}
+BUTTONS = {
+    "pause": ("Pause", "pause", ("running",)), "stop": ("Stop", "stop", ("running", "queued")),
+    "resume": ("Go on", "play_arrow", ("paused", "stopped", "failed")),
+}  # fmt: skip
+"""Labels and icons of methods of Jobs, and the states in which they are offered."""
 
 
 class LiveView:
@@ -42,19 +45,18 @@ class LiveView:
     def __init__(self, work: Workspace) -> None:
         self.work, self.job = work, ""
         self._cache: dict[str, Any] = {}
-        with ui.element("section").classes("card").props('aria-label="The run"'):
-            ui.html("<h2>The run</h2>", sanitize=False)
+        with card("The run"):
             self.choice = select("Run", {}).on_value_change(lambda event: self.follow(event.value))
-            self.status = ui.html("", sanitize=False).classes("status").props('aria-live="off"')
+            self.status = html().classes("status").props('aria-live="off"')
             self.bar = ui.linear_progress(0.0, show_value=False).props('aria-label="Progress"')
             with ui.row().classes("gap-2"):
                 self.buttons = {
-                    name: ui.button(text, icon=icon, on_click=lambda n=name: self._do(n)).props("outline no-caps dense")
-                    for name, (text, icon) in BUTTONS.items()
+                    name: ui.button(text, icon=icon, on_click=lambda n=name: self._do(n)).props("outline dense")
+                    for name, (text, icon, _) in BUTTONS.items()
                 }
             self.chart = ui.echart(curve_options({})).classes("curve").style("height: 260px; width: 100%")
             self.surface = LiveSurface()
-            self.images = ui.html("", sanitize=False)
+            self.images = html()
         self.chart.set_visibility(False)
         ui.timer(EVERY, self._refresh)
 
@@ -80,7 +82,7 @@ class LiveView:
         job = next((job for job in jobs if job.id == self.job), None)
         for name, button in self.buttons.items():
             state = "" if job is None or (job.request and job.state == "running") else job.state
-            button.set_visibility(state in STATES[name])
+            button.set_visibility(state in BUTTONS[name][2])
         self.bar.set_visibility(job is not None)
         self.choice.set_visibility(bool(jobs))
         if job is not None:
@@ -104,7 +106,6 @@ class LiveView:
         self.bar.set_value(float(live.get("progress") or 0.0) if live else float(job.state == "done"))
         if live and live.get("curve"):
             self.chart.set_visibility(True)
-            self.chart.options.clear()
             self.chart.options.update(curve_options(live["curve"]))
         if news is not None:
             images, box, caption = news
@@ -155,20 +156,16 @@ def status_html(job: CommandRun, live: dict[str, Any], title: str = "") -> str:
 
 def curve_options(curve: dict[str, list[float | None]]) -> dict[str, Any]:
     """Return the options of the chart of the losses over time."""
-    names = [name for name in CURVES if name in curve]
-    seconds = curve.get("seconds", [])
     series = [
         {
             "name": name.replace("_", " "), "type": "line", "showSymbol": False, "animation": False,
-            "data": [[s, y] for s, y in zip(seconds, curve[name], strict=True) if y is not None and y > 0],
+            "data": [[s, y] for s, y in zip(curve["seconds"], curve[name], strict=True) if y is not None and y > 0],
         }
-        for name in names
+        for name in CURVES if name in curve
     ]  # fmt: skip
     return {
         "grid": {"left": 64, "right": 16, "top": 34, "bottom": 42},
-        "legend": {"top": 0, "textStyle": {"color": GREY}},
-        "color": COLOURS,
-        "tooltip": {"trigger": "axis"},
+        "legend": {"top": 0, "textStyle": {"color": GREY}}, "color": COLOURS, "tooltip": {"trigger": "axis"},
         "xAxis": {"type": "value", "name": "s", "nameLocation": "middle", "nameGap": 26, **GRID},
         "yAxis": {"type": "log", **GRID}, "series": series, "aria": {"enabled": True},
     }  # fmt: skip

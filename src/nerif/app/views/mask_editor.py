@@ -11,7 +11,7 @@ from typing import Any
 
 from nicegui import ui
 
-from nerif.app.forms.elements import dialog, refusals, select, text_html
+from nerif.app.forms.elements import dialog, html, image, refusals, select, text_html
 from nerif.app.forms.form import Form
 from nerif.app.forms.job_form import JobForm
 from nerif.app.project.folder import OWN
@@ -20,7 +20,6 @@ from nerif.app.views.edits import Edits, UndoButtons
 from nerif.app.views.view_maps import magnitude_address, threshold_address
 from nerif.cli.commands.mask import Mask
 from nerif.data.measurement import Measurement
-from nerif.imaging.imaging_settings import MaskSettings
 from nerif.imaging.masks import MaskShape, write_masks
 
 __all__ = ["MaskCard"]
@@ -94,18 +93,16 @@ class MaskCard:
         self.work, self.page, self.name, self.measurement = work, page, name, measurement
         original: dict[str, Shapes] = dict.fromkeys(measurement.names, ())
         self.edits = Edits(original, _shapes, work.draft(page).get("masks", {}).get(name))
-        self.view = select("View", list(measurement.names), measurement.names[0]).classes("short")
+        self.brush, self._lock = Brush(), asyncio.Lock()
+        self.corners: list[tuple[float, float]] = []  # of the polygon that is not closed yet
+        self.view = select("View", list(measurement.names)).classes("short")
         self.view.props["aria-label"] = "View to draw in"
         with ui.element("div").classes("numbers"):
             self.undo = UndoButtons(self.edits, self._step)
-            button = ui.button("Show the threshold's mask", icon="contrast", on_click=self._threshold)
-            button.props("flat no-caps dense")
-        self.brush = Brush()
-        self.place = ui.element("div").classes("stack")
-        self.status = ui.html("", sanitize=False).classes("status").props('aria-live="polite"')
-        record = Mask(Path(name), Path("masked.nc"))
-        self._lock = asyncio.Lock()
-        form = Form(record, only=SETTINGS)
+            ui.button("Show the threshold's mask", icon="contrast", on_click=self._threshold).props("flat dense")
+        self.place = ui.element("div").classes("stack").on("keydown", self._key, js_handler=KEYS)
+        self.status = html().classes("status").props('aria-live="polite"')
+        form = Form(Mask(Path(name), Path("masked.nc")), only=SETTINGS)
         self.job = JobForm(
             work, f"{page}.mask", form, self._words, "Apply the masks", SETTINGS[:1], before=self._write, subject=name,
             on_continue=on_continue,
@@ -118,41 +115,121 @@ class MaskCard:
         """Folder of the drawn masks, relative to the project."""
         return f"{OWN}/masks/{self.name.removesuffix('.nc')}"
 
-    @property
-    def out(self) -> str:
-        """Name of the new measurement."""
-        return self.work.project.free_name(f"{self.name.removesuffix('.nc')}.masked.nc")
-
     def _words(self) -> list[str]:
-        option = ["--drawings", self.folder] if self.edits.changes else []
-        return ["mask", self.name, "--out", self.out, *option]
+        out = self.work.project.free_name(f"{self.name.removesuffix('.nc')}.masked.nc")
+        return ["mask", self.name, "--out", out, *(["--drawings", self.folder] if self.edits.changes else [])]
+
+    @property
+    def _index(self) -> int:
+        return self.measurement.names.index(self.view.value)
+
+    @property
+    def _shape(self) -> tuple[int, int]:
+        """Height and width of the selected view, px."""
+        return self.measurement.cameras[self._index].image_size
+
+    # -- the editor ----------------------------------------------------------------------------------------------
 
     def _build_editor(self) -> None:
-        """Build the editor of the selected view."""
+        """Build tools, image and shapes of the selected view."""
+        name, brush, (height, width) = self.view.value, self.brush, self._shape
+        self.corners = []
         self.place.clear()
         with self.place:
-            index = self.measurement.names.index(str(self.view.value))
-            shape = self.measurement.cameras[index].image_size
-            address = magnitude_address(self.measurement, index)
-            self.editor = MaskEditor(
-                str(self.view.value), shape, address, self.edits, self.brush, self._store, self._step_by_key
-            )  # fmt: skip
-        self._show_views()
+            with ui.element("div").classes("numbers"):
+                tool = ui.toggle(TOOLS, value=brush.tool).props('aria-label="Tool"')
+                tool.on_value_change(lambda event: setattr(brush, "tool", event.value))
+                self._effect = ui.toggle(EFFECTS, value=brush.inside).props('aria-label="Effect of the shape"')
+                self._effect.on_value_change(lambda event: setattr(brush, "inside", event.value))
+                self._size = ui.number("Width of the brush", value=brush.width, min=1, step=1, suffix="px")
+                self._size.props["aria-label"] = "Width of the brush (px)"
+                self._size.on_value_change(lambda event: setattr(brush, "width", event.value))
+            with ui.element("div").classes("cropper").on("pointerdown", self._stroke, js_handler=STROKE) as self._image:
+                self._image.style(f"aspect-ratio: {width / height:.4f}; --aspect: {width / height:.4f}")
+                self._image.props('tabindex=0 role=group aria-keyshortcuts="[ ] E Control+Z Control+Shift+Z"')
+                self._image.props["aria-label"] = f"Drawing in view {name}"
+                address = magnitude_address(self.measurement, self._index)
+                image(address, f"Magnitude of the signal in view {name}").props("draggable=false")
+                self._over = html().classes("over")
+            html(f"<p>{KEY_HELP}</p>").classes("help")
+            with ui.element("div").classes("numbers"):
+                x, y = self._number("Column", width), self._number("Row", height)
+
+                def add_corner() -> None:
+                    self.corners.append((float(x.value or 0), float(y.value or 0)))
+                    self._draw()
+
+                for text, icon, act in (
+                    ("Add a corner", "add", add_corner), ("Close the polygon", "pentagon", self._close),
+                    ("Clear the view", "layers_clear", lambda: self._put(())),
+                ):  # fmt: skip
+                    ui.button(text, icon=icon, on_click=act).props("outline dense")
+        self._draw()
+
+    def _number(self, label: str, size: int) -> ui.number:
+        control = ui.number(label, value=0, min=0, max=size - 1, step=1, suffix="px")
+        control.props["aria-label"] = f"{label} of the next corner (px)"
+        return control
+
+    def _stroke(self, event: Any) -> None:
+        height, width = self._shape
+        points = [(x * width - 0.5, y * height - 0.5) for x, y in event.args]
+        if not points:
+            return
+        if self.brush.tool == "brush":
+            self._add("brush", points, float(self.brush.width or 0))
+        else:
+            self.corners.append(points[-1])
+            self._draw()
+
+    def _key(self, event: Any) -> None:
+        """Do what a key of KEYS stands for."""
+        if event.args in ("smaller", "larger"):
+            self.brush.resize(event.args == "larger", max(self._shape))
+            self._size.set_value(self.brush.width)
+        elif event.args == "effect":
+            self._effect.set_value(not self.brush.inside)
+        elif event.args == "undo" and self.corners:
+            self.corners.pop()
+            self._draw()
+        else:
+            self.undo.step(event.args == "undo")
+            focus = f"getHtmlElement({self._image.id})?.focus({{preventScroll: true}})"
+            ui.run_javascript(f"setTimeout(() => {focus}, 50)")  # a new editor is on the page only then
+
+    def _close(self) -> None:
+        self._add("polygon", self.corners)
+
+    def _add(self, kind: Any, points: Sequence[tuple[float, float]], *width: float) -> None:
+        with refusals():
+            shape = MaskShape(kind, tuple(points), bool(self.brush.inside), *width)
+            self._put((*self.edits.now[self.view.value], shape))
+
+    def _put(self, shapes: Shapes) -> None:
+        self.corners = []
+        self.edits.put(self.view.value, shapes)
+        self._draw()
+        self._store()
 
     def _step(self, view: str) -> None:
         if view == self.view.value:
-            self.editor.show()  # a new editor would lose the focus, and the next key
+            self._draw()  # a new editor would lose the focus, and the next key
         else:
             self.view.set_value(view)
         self._store()
 
-    def _step_by_key(self, back: bool) -> None:
-        """Undo or redo; the keys stay with the editor, which is a new one after a step in another view."""
-        if back:
-            self.undo.undo()
-        else:
-            self.undo.redo()
-        self.editor.focus()
+    def _draw(self) -> None:
+        """Draw the shapes and the open polygon, and name the views that have shapes."""
+        height, width = self._shape
+        shapes = "".join(map(_svg, self.edits.now[self.view.value]))
+        dots = "".join(f"<circle cx={x:.2f} cy={y:.2f} r={width / 120:.2f} />" for x, y in self.corners)
+        path = " ".join(f"{x:.2f},{y:.2f}" for x, y in self.corners)
+        draft = f"<g class=draft><polyline points='{path}' />{dots}</g>" if self.corners else ""
+        box = f"-0.5 -0.5 {width} {height}"
+        self._over.set_content(f"<svg viewBox='{box}' preserveAspectRatio=none aria-hidden=true>{shapes}{draft}</svg>")
+        self.status.set_content(escape(f"Drawn in {', '.join(self.edits.changes) or 'no view'}."))
+
+    # -- masks ---------------------------------------------------------------------------------------------------
 
     def _store(self) -> None:
         """Store the shapes in the draft and as the images that `nerif mask` reads."""
@@ -161,7 +238,6 @@ class MaskCard:
         self.work.keep(self.page, {**draft, "masks": masks})
         self.job.show()
         self.undo.show()
-        self._show_views()
 
         async def write() -> None:
             with refusals():
@@ -183,131 +259,14 @@ class MaskCard:
 
             await self.work.in_thread(work)
 
-    def _show_views(self) -> None:
-        views = ", ".join(self.edits.changes) or "no view"
-        self.status.set_content(escape(f"Drawn in {views}."))
-
     async def _threshold(self) -> None:
-        index = self.measurement.names.index(str(self.view.value))
         with refusals():
-            record = self.job.view.record()
-            settings: MaskSettings = record.masks
-            address = await self.work.in_thread(threshold_address, self.measurement, index, settings, record.sigma)
+            record: Mask = self.job.view.record()
+            what = self.measurement, self._index, record.masks, record.sigma
+            address = await self.work.in_thread(threshold_address, *what)
             with dialog():
                 text_html(f"Threshold mask of view {self.view.value}; white: flow", "h3")
-                image = ui.element("img").style("width: min(70vw, 600px); image-rendering: pixelated")
-                image.props["src"], image.props["alt"] = address, "Threshold mask"
-
-
-class MaskEditor:
-    """Tools, the image of the view and the shapes over it.
-
-    Parameters
-    ----------
-    name : name of the view
-    shape : height and width, px
-    address : address of its image
-    edits : shapes of all views, changes in place
-    brush : the tool, changed in place
-    on_change : called after each step
-    on_step : called with whether to undo, else to redo
-    """
-
-    def __init__(
-        self, name: str, shape: tuple[int, int], address: str, edits: Edits[Shapes], brush: Brush,
-        on_change: Callable[[], None], on_step: Callable[[bool], None],
-    ) -> None:  # fmt: skip
-        self.name, self.shape, self.edits, self.brush = name, shape, edits, brush
-        self._on_change, self._on_step = on_change, on_step
-        self.corners: list[tuple[float, float]] = []
-        height, width = shape
-        with ui.element("div").classes("stack").on("keydown", self._key, js_handler=KEYS):
-            with ui.element("div").classes("numbers"):
-                tool = ui.toggle(TOOLS, value=brush.tool).props('no-caps aria-label="Tool"')
-                tool.on_value_change(lambda event: setattr(brush, "tool", event.value))
-                self._effect = ui.toggle(EFFECTS, value=brush.inside).props('no-caps aria-label="Effect of the shape"')
-                self._effect.on_value_change(lambda event: setattr(brush, "inside", event.value))
-                self._size = ui.number("Width of the brush", value=brush.width, min=1, step=1, suffix="px")
-                self._size.props("outlined dense").props["aria-label"] = "Width of the brush (px)"
-                self._size.on_value_change(lambda event: setattr(brush, "width", event.value))
-            with ui.element("div").classes("cropper").on("pointerdown", self._stroke, js_handler=STROKE) as self._place:
-                self._place.style(f"aspect-ratio: {width / height:.4f}; --aspect: {width / height:.4f}")
-                self._place.props('tabindex=0 role=group aria-keyshortcuts="[ ] E Control+Z Control+Shift+Z"')
-                self._place.props["aria-label"] = f"Drawing in view {name}"
-                image = ui.element("img").props("draggable=false")
-                image.props["src"], image.props["alt"] = address, f"Magnitude of the signal in view {name}"
-                self._over = ui.html("", sanitize=False).classes("over")
-            ui.html(f"<p>{KEY_HELP}</p>", sanitize=False).classes("help")
-            with ui.element("div").classes("numbers"):
-                self._x, self._y = self._number("Column", width), self._number("Row", height)
-                self._button("Add a corner", "add", self._add_corner)
-                self._button("Close the polygon", "pentagon", self._close)
-                self._button("Clear the view", "layers_clear", lambda: self._put(()))
-        self.show()
-
-    def focus(self) -> None:
-        """Move the focus into the image."""
-        move = f"getHtmlElement({self._place.id})?.focus({{preventScroll: true}})"
-        ui.run_javascript(f"setTimeout(() => {move}, 50)")  # a new editor is on the page only then
-
-    def _number(self, label: str, size: int) -> ui.number:
-        control = ui.number(label, value=0, min=0, max=size - 1, step=1, suffix="px").props("outlined dense")
-        control.props["aria-label"] = f"{label} of the next corner (px)"
-        return control
-
-    def _button(self, label: str, icon: str, act: Callable[[], None]) -> None:
-        ui.button(label, icon=icon, on_click=lambda: act()).props("outline no-caps dense")
-
-    def _stroke(self, event: Any) -> None:
-        height, width = self.shape
-        points = [(x * width - 0.5, y * height - 0.5) for x, y in event.args]
-        if not points:
-            return
-        if self.brush.tool == "brush":
-            with refusals():
-                brush = MaskShape("brush", tuple(points), bool(self.brush.inside), float(self.brush.width or 0))
-                self._put((*self.edits.now[self.name], brush))
-            return
-        self.corners.append(points[-1])
-        self.show()
-
-    def _key(self, event: Any) -> None:
-        """Do what a key of KEYS stands for."""
-        if event.args in ("smaller", "larger"):
-            self.brush.resize(event.args == "larger", max(self.shape))
-            self._size.set_value(self.brush.width)
-        elif event.args == "effect":
-            self._effect.set_value(not self.brush.inside)
-        elif event.args == "undo" and self.corners:  # of the polygon that is not closed yet
-            self.corners.pop()
-            self.show()
-        else:
-            self._on_step(event.args == "undo")
-
-    def _add_corner(self) -> None:
-        self.corners.append((float(self._x.value or 0), float(self._y.value or 0)))
-        self.show()
-
-    def _close(self) -> None:
-        with refusals():
-            polygon = MaskShape("polygon", tuple(self.corners), bool(self.brush.inside))
-            self._put((*self.edits.now[self.name], polygon))
-
-    def _put(self, shapes: Shapes) -> None:
-        self.corners = []
-        self.edits.put(self.name, shapes)
-        self.show()
-        self._on_change()
-
-    def show(self) -> None:
-        """Draw the shapes and the open polygon."""
-        height, width = self.shape
-        shapes = "".join(map(_svg, self.edits.now[self.name]))
-        dots = "".join(f"<circle cx={x:.2f} cy={y:.2f} r={width / 120:.2f} />" for x, y in self.corners)
-        path = " ".join(f"{x:.2f},{y:.2f}" for x, y in self.corners)
-        draft = f"<g class=draft><polyline points='{path}' />{dots}</g>" if self.corners else ""
-        box = f"-0.5 -0.5 {width} {height}"
-        self._over.set_content(f"<svg viewBox='{box}' preserveAspectRatio=none aria-hidden=true>{shapes}{draft}</svg>")
+                image(address, "Threshold mask").style("width: min(70vw, 600px); image-rendering: pixelated")
 
 
 def _svg(shape: MaskShape) -> str:

@@ -11,6 +11,7 @@ from nicegui import ui
 
 from nerif.analysis.evaluation import rms_with_unit
 from nerif.analysis.verdict import verdict
+from nerif.app.forms.elements import html
 from nerif.app.project.folder import Contents, ProjectFolder
 from nerif.common.conventions import InputError
 from nerif.data.velocity_sequence import VelocitySequence, open_volumes
@@ -99,20 +100,16 @@ def result_table(rows: Sequence[Row], selection: str, choose: Callable[[str], Aw
     """Build the table, with a button per row that selects it."""
     around = ui.element("div").classes("tabled").props('tabindex=0 role=region aria-label="Results"')
     with around, ui.element("table"):
-        with ui.element("thead"), ui.element("tr"):
-            for title in HEAD:
-                ui.html(escape(title), sanitize=False, tag="th").props("scope=col")
+        html(f"<tr>{''.join(f'<th scope=col>{escape(title)}</th>' for title in HEAD)}</tr>", "thead")
         with ui.element("tbody"):
             for row in rows:
-                _line(row, row.name == selection, choose)
-
-
-def _line(row: Row, active: bool, choose: Callable[[str], Awaitable[None]]) -> None:
-    with ui.element("tr").classes("chosen" if active else ""):
-        with ui.element("th").props("scope=row"):
-            button = ui.button(row.title, on_click=lambda: choose(row.name)).props("flat dense no-caps align=left")
-            button.props["aria-label"] = f"Show {row.title}"
-            button.props["aria-pressed"] = "true" if active else "false"
-        for title, cell in zip(HEAD[1:], row.cells, strict=True):
-            verdict_class = f"verdict {CLASSES.get(row.word, '')}" if title == "Verdict" and cell else ""
-            ui.html(escape(cell), sanitize=False, tag="td").classes(verdict_class)
+                active = row.name == selection
+                with ui.element("tr").classes("chosen" if active else ""):
+                    with ui.element("th").props("scope=row"):
+                        button = ui.button(row.title, on_click=lambda name=row.name: choose(name))
+                        button.props("flat dense align=left").props.update(
+                            {"aria-label": f"Show {row.title}", "aria-pressed": "true" if active else "false"}
+                        )
+                    for title, cell in zip(HEAD[1:], row.cells, strict=True):
+                        verdict_class = f"verdict {CLASSES.get(row.word, '')}" if title == "Verdict" and cell else ""
+                        html(escape(cell), "td").classes(verdict_class)

@@ -12,7 +12,7 @@ from typing import Any
 from nicegui import ui
 
 from nerif.analysis.resampling import common_grid, difference, resampled
-from nerif.app.forms.elements import select, text_html
+from nerif.app.forms.elements import html, select, text_html
 from nerif.app.forms.sliders import RangeSlider
 from nerif.app.project.workspace import Workspace
 from nerif.app.views.result_volumes import Source, source_of
@@ -50,7 +50,6 @@ class ResultView:
         self.work, self.name, self.others, self.draft, self.keep = work, name, tuple(others), draft, keep
         self.readable = False  # whether it has a field
         self.step = 0
-        self._timer: ui.timer | None = None
 
     # -- controls ------------------------------------------------------------------------------------------------
 
@@ -76,45 +75,38 @@ class ResultView:
             control.on_value_change(self._update_draft)
         if len(self.source.frames) > 1:
             self._build_time()
-        self.note = ui.html("", sanitize=False).props("aria-live=polite")
+        self.note = html().props("aria-live=polite")
         self.slices = SlicesView(self.work)
         await self.draw()
 
     def _build_time(self) -> None:
-        source = self.source
+        times, frames = self.source.times, self.source.frames
 
         async def move(step: int) -> None:
             self.step = step
             await self.draw()
 
-        with ui.element("div").classes("time"):
-            self.play = ui.button(icon="play_arrow", on_click=self._play).props("round unelevated dense")
-            self.play.props["aria-label"] = "Play or pause the film"
-
-            def text(step: int) -> str:
-                return f"{source.times[source.frames[step]] * 1e3:.10g} ms (frame {source.frames[step] + 1})"
-
-            self.time = RangeSlider("Time", len(source.frames) - 1, 0, text, move)
-
-    def _play(self) -> None:
-        if self._timer is not None:
-            self._timer.cancel()
-            self._timer = None
-            self.play.props("icon=play_arrow")
-            return
-
         async def advance() -> None:
-            self.step = (self.step + 1) % len(self.source.frames)
-            self.time.put(self.step)
+            self.step = (self.step + 1) % len(frames)
+            time.put(self.step)
             await self.draw()
 
-        self._timer = ui.timer(PLAY_EVERY, advance)
-        self.play.props("icon=pause")
+        def toggle() -> None:
+            timer.active = not timer.active
+            play.set_icon("pause" if timer.active else "play_arrow")
+
+        def text(step: int) -> str:
+            return f"{times[frames[step]] * 1e3:.10g} ms (frame {frames[step] + 1})"
+
+        with ui.element("div").classes("time"):
+            play = ui.button(icon="play_arrow", on_click=toggle).props("round unelevated dense")
+            play.props["aria-label"] = "Play or pause the film"
+            time = RangeSlider("Time", len(frames) - 1, 0, text, move)
+        timer = ui.timer(PLAY_EVERY, advance, active=False)
 
     async def _update_draft(self) -> None:
-        self.draft |= {
-            "quantity": self.quantity.value, "against": self.against.value, "spread": bool(self.spread.value),
-        }  # fmt: skip
+        spread = bool(self.spread.value)
+        self.draft |= {"quantity": self.quantity.value, "against": self.against.value, "spread": spread}
         self.keep()
         await self.draw()
 
@@ -157,11 +149,9 @@ class ResultView:
         change = difference(first, second, grid)
         ends = map_range(change.values.numpy(), True, 0.998)
         title, other_title = map(self.work.project.title, (self.name, against))
-        panels = [
-            Panel(title, resampled(first, grid), limits, unit, colours),
-            Panel(other_title, resampled(second, grid), limits, unit, colours),
-            Panel(f"{other_title} minus {title}", change, ends, unit, DIVERGING),
-        ]
+        volumes = ((title, first), (other_title, second))
+        panels = [Panel(name, resampled(volume, grid), limits, unit, colours) for name, volume in volumes]
+        panels.append(Panel(f"{other_title} minus {title}", change, ends, unit, DIVERGING))
         if first.grid == second.grid:
             return panels, ""
         shape = " × ".join(str(n) for n in grid.shape[::-1])
@@ -169,10 +159,10 @@ class ResultView:
 
     def _nearest_frame(self, other: Source, against: str, step: int) -> int:
         """The frame of another source that is nearest in time to a step."""
-        source = self.source
-        now = source.times[source.frames[step]]
+        times = self.source.times
+        now = times[self.source.frames[step]]
         nearest = min(other.frames, key=lambda frame: abs(other.times[frame] - now))
-        if abs(other.times[nearest] - now) > CLOSE * min(_interval(source.times), _interval(other.times)):
+        if abs(other.times[nearest] - now) > CLOSE * min(_interval(times), _interval(other.times)):
             at, closest = (f"{time * 1e3:.10g} ms" for time in (now, other.times[nearest]))
             raise InputError(
                 f"expected a frame at {at} to compare with, got {closest} as the nearest complete frame; "
@@ -188,8 +178,10 @@ class ResultView:
         if not self.readable:
             text_html("There is no field to show yet.", classes="note")
             return
-        quantity, against = self.quantity.value, self.against.value
-        volume, limits, level = await self.work.in_thread(self._volume, quantity)
+        source, quantity, against = self.source, self.quantity.value, self.against.value
+        volume, limits, level = await self.work.in_thread(
+            lambda: (source.volume(quantity, self.frame), source.limits(quantity), source.level(quantity))
+        )
         if min(volume.grid.shape) < 2:
             text_html("The field is a plane and has no isosurface.", classes="note")
             return
@@ -199,10 +191,6 @@ class ResultView:
             other = await self.work.in_thread(self._open, against)
             surfaces.append(self._surface_of(against, self._nearest_frame(other, against, self.step)))
         view.show(surfaces)
-
-    def _volume(self, quantity: str) -> tuple[Volume, tuple[float, float], float]:
-        volume = self.source.volume(quantity, self.frame)
-        return volume, self.source.limits(quantity), self.source.level(quantity)
 
     def _surface_of(self, name: str, frame: int) -> Surface:
         path = self.work.project.path(name)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import Protocol
 
 from nerif.common.conventions import STATISTICS, InputError
 from nerif.common.files import ending
@@ -22,20 +21,6 @@ from nerif.results.directory import VOLUME
 __all__ = ["FilmVolumes", "ResultVolumes", "Source", "film_progress", "source_of"]
 
 Limits = tuple[float, float]
-
-
-class Source(Protocol):
-    """Volumes of several quantities on one grid, at one or more instants."""
-
-    @property
-    def quantities(self) -> tuple[str, ...]: ...
-    @property
-    def times(self) -> tuple[float, ...]: ...
-    @property
-    def frames(self) -> Sequence[int]: ...
-    def volume(self, quantity: str, frame: int = 0) -> Volume: ...
-    def limits(self, quantity: str) -> Limits: ...
-    def level(self, quantity: str) -> float: ...
 
 
 class ResultVolumes:
@@ -101,6 +86,10 @@ class FilmVolumes:
         return _over_time(str(self.path), self._stamp, quantity, tuple(self.frames))[1]
 
 
+Source = ResultVolumes | FilmVolumes
+"""Volumes of several quantities on one grid, at one or more instants."""
+
+
 def source_of(path: Path) -> Source:
     """Open a result directory or a store over time."""
     return FilmVolumes(path) if ending(path) == ".zarr" else ResultVolumes(path)
@@ -108,11 +97,9 @@ def source_of(path: Path) -> Source:
 
 def film_progress(path: Path) -> tuple[float, str]:
     """Return the fraction of complete frames of a film, and the count as text; 0 and empty before there is a store."""
-    if not (path / "zarr.json").is_file():
-        return 0.0, ""
     try:
         store = open_volumes(path)
-    except InputError:  # incomplete
+    except (InputError, FileNotFoundError):  # incomplete
         return 0.0, ""
     done, count = len(finished_frames(store)), len(store)
     return done / max(count, 1), f"{done} of {count} frames"

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from nicegui import ui
 
-from nerif.app.forms.elements import table_html, text_html
+from nerif.app.forms.elements import html, table_html, text_html
 from nerif.app.views.surfaces import GROUND, scene_of
 from nerif.common.conventions import InputError
 from nerif.geometry import Box, Camera
@@ -68,8 +66,11 @@ def show_rig(rig: Rig) -> None:
     centre, reach = (points.max(axis=0) + points.min(axis=0)) / 2, float(np.ptp(points, axis=0).max()) or 1.0
     scale = SIZE / reach
 
+    def at(point: np.ndarray) -> list[float]:
+        return list(((point - centre) * scale).tolist())
+
     def line(a: np.ndarray, b: np.ndarray, colour: str) -> None:
-        scene.line(((a - centre) * scale).tolist(), ((b - centre) * scale).tolist()).material(colour)
+        scene.line(at(a), at(b)).material(colour)
 
     def outline(corners: np.ndarray, colour: str) -> None:
         for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True):
@@ -86,32 +87,25 @@ def show_rig(rig: Rig) -> None:
                 line(tip, end, BEYOND)
             if one.background is not None:
                 outline(corners.end, colour)
-            at = (corners.start.mean(axis=0) - 0.04 * reach * corners.direction.mean(axis=0) - centre) * scale
+            place = corners.start.mean(axis=0) - 0.04 * reach * corners.direction.mean(axis=0)
             style = f"color: #16202b; background: {GROUND}; font: 600 13px system-ui; border-bottom: 3px solid {colour}"
-            scene.text(one.name, style=style).move(*at.tolist())
+            scene.text(one.name, style=style).move(*at(place))
         if rig.box is not None:
             ends = np.array(list(itertools.product(*zip(rig.box.lower, rig.box.upper, strict=True))))
             for a, b in itertools.combinations(ends, 2):
                 if np.count_nonzero(a != b) == 1:
                     line(a, b, "#16202b")
         for axis, colour in enumerate(("#c62828", "#2e7d32", "#1565c0")):
-            end = np.zeros(3)
-            end[axis] = 0.1 * reach
+            end = 0.1 * reach * np.eye(3)[axis]
             line(np.zeros(3), end, colour)
-            scene.text("xyz"[axis], style=f"color: {colour}; font: 700 13px system-ui").move(
-                *((1.15 * end - centre) * scale).tolist()
-            )
+            scene.text("xyz"[axis], style=f"color: {colour}; font: 700 13px system-ui").move(*at(1.15 * end))
     scene.move_camera(0.8 * SIZE, -1.05 * SIZE, 0.75 * SIZE, 0, 0, 0, duration=0)
-    ui.html(_table(rig.cameras, rig.errors), sanitize=False)
-
-
-def _table(cameras: Sequence[Camera], errors: Sequence[ImageError]) -> str:
     rows: dict[str, tuple[str, ...]] = {}
-    for camera in cameras:
-        camera_errors = [e for e in errors if e.camera == camera.name]
+    for camera in rig.cameras:
+        camera_errors = [e for e in rig.errors if e.camera == camera.name]
         height, width = camera.image_size
         used = f"{sum(e.used for e in camera_errors)} of {len(camera_errors)}" if camera_errors else "unknown"
         rms = f"{rms_of(camera_errors):.3f}" if any(e.used for e in camera_errors) else "unknown"
         place = ", ".join(f"{round(float(x), 1) + 0.0:.1f}" for x in camera.centre)
         rows[camera.name] = (f"{width} × {height}", f"{float(camera.intrinsics[0, 0]):.1f}", place, used, rms)
-    return table_html("Cameras", HEAD, rows)
+    html(table_html("Cameras", HEAD, rows))

@@ -19,7 +19,6 @@ from nerif.app.project.workspace import Workspace
 from nerif.app.views.result_volumes import source_of
 from nerif.common.conventions import InputError
 from nerif.common.files import ending
-from nerif.data.volume import Volume
 from nerif.report.isosurface import default_level, stl_of, surface_triangles
 from nerif.results.directory import REPORT, ResultDirectory
 from nerif.results.live import read_snapshot
@@ -32,7 +31,7 @@ SANDBOX = (
 )
 CACHE = "private, max-age=3600"  # the address changes with the file
 
-Respond = Callable[[Workspace, Mapping[str, str]], Response]
+Respond = Callable[[Workspace, Path, Mapping[str, str]], Response]
 Handler = Callable[[Request], Awaitable[Response]]
 
 
@@ -43,52 +42,50 @@ def report_file(path: Path) -> Path:
 
 def report_address(name: str, stamp: int) -> str:
     """Return the address of a report; `stamp` changes with its file."""
-    return "report?" + urlencode({"of": name, "stamp": stamp}, quote_via=quote)
+    return _address("report", of=name, stamp=stamp)
 
 
 def surface_address(name: str, quantity: str, level: float, frame: int, stamp: int) -> str:
     """Return the address of an isosurface."""
-    query = {"of": name, "quantity": quantity, "level": repr(level), "frame": frame, "stamp": stamp}
-    return "surface?" + urlencode(query, quote_via=quote)
+    return _address("surface", of=name, quantity=quantity, level=repr(level), frame=frame, stamp=stamp)
 
 
 def bodies_address(name: str, stamp: int) -> str:
     """Return the address of the surface of the bodies in the flow of a result."""
-    return "bodies?" + urlencode({"of": name, "stamp": stamp}, quote_via=quote)
+    return _address("bodies", of=name, stamp=stamp)
 
 
 def live_address(name: str, stamp: int) -> str:
     """Return the address of the isosurface of the last preview of a run."""
-    return "live-surface?" + urlencode({"of": name, "stamp": stamp}, quote_via=quote)
+    return _address("live-surface", of=name, stamp=stamp)
 
 
-def _report(work: Workspace, query: Mapping[str, str]) -> Response:
-    file = work.project.path(report_file(work.project.path(query.get("of", ""))))
+def _address(path: str, **query: str | int) -> str:
+    return f"{path}?{urlencode(query, quote_via=quote)}"
+
+
+def _report(work: Workspace, path: Path, query: Mapping[str, str]) -> Response:
+    file = work.project.path(report_file(path))
     if not file.is_file():
         raise InputError("There is no report yet: nerif report writes it.")
     headers = {"content-security-policy": SANDBOX, "cache-control": CACHE}
     return FileResponse(file, media_type="text/html; charset=utf-8", headers=headers)
 
 
-def _surface(work: Workspace, query: Mapping[str, str]) -> Response:
+def _surface(work: Workspace, path: Path, query: Mapping[str, str]) -> Response:
     level, frame = float(query.get("level", "0")), int(query.get("frame", "0"))
-    volumes = source_of(work.project.path(query.get("of", "")))
-    return _stl_response(volumes.volume(query.get("quantity", ""), frame), level)
+    return _stl(surface_triangles(source_of(path).volume(query.get("quantity", ""), frame), level))
 
 
-def _live_surface(work: Workspace, query: Mapping[str, str]) -> Response:
-    snapshot = read_snapshot(work.project.path(query.get("of", "")))
+def _live_surface(work: Workspace, path: Path, query: Mapping[str, str]) -> Response:
+    snapshot = read_snapshot(path)
     if snapshot is None:
         raise InputError("There is no preview of the field yet.")
-    return _stl_response(snapshot.volume, default_level(snapshot.volume))
+    return _stl(surface_triangles(snapshot.volume, default_level(snapshot.volume)))
 
 
-def _stl_response(volume: Volume, level: float) -> Response:
-    return _stl(surface_triangles(volume, level))
-
-
-def _bodies(work: Workspace, query: Mapping[str, str]) -> Response:
-    bodies = ResultDirectory(work.project.path(query.get("of", ""))).bodies()
+def _bodies(work: Workspace, path: Path, query: Mapping[str, str]) -> Response:
+    bodies = ResultDirectory(path).bodies()
     return _stl(np.concatenate([body.corners.numpy() for body in bodies] or [np.zeros((0, 3, 3))]))
 
 
@@ -104,8 +101,9 @@ def routes(work: Workspace) -> dict[str, Handler]:
 
     def handler(respond: Respond) -> Handler:
         async def handle(request: Request) -> Response:
+            query = request.query_params
             try:
-                return await work.in_thread(respond, work, request.query_params)
+                return await work.in_thread(respond, work, work.project.path(query.get("of", "")), query)
             except ValueError as error:  # also an InputError
                 return PlainTextResponse(str(error), 404)
 

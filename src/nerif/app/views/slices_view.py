@@ -9,6 +9,7 @@ from typing import Any
 
 from nicegui import ui
 
+from nerif.app.forms.elements import html, image
 from nerif.app.forms.sliders import RangeSlider
 from nerif.app.project.workspace import Workspace
 from nerif.data.volume import Volume
@@ -51,7 +52,7 @@ class SlicesView:
         self._busy = False
         self._layout: tuple[Any, ...] = ()
         self._images: dict[tuple[str, int], Any] = {}
-        self._bars = ui.html("", sanitize=False)
+        self._bars = html()
         self._place = ui.element("div")
 
     async def show(self, panels: Sequence[Panel]) -> None:
@@ -68,14 +69,10 @@ class SlicesView:
     def _build(self) -> None:
         self._place.clear()
         self._images = {}
-        many = len(self.panels) > 1
-        self._place.classes(replace=f"cuts {'many' if many else 'one'}")
-        if not self.panels:
-            return
-        with self._place:
-            for normal in NORMALS:
-                with ui.element("div").classes("cut"):
-                    self._cut(normal, self.panels[0].volume.grid)
+        self._place.classes(replace=f"cuts {'many' if len(self.panels) > 1 else 'one'}")
+        for normal in NORMALS if self.panels else "":
+            with self._place, ui.element("div").classes("cut"):
+                self._cut(normal, self.panels[0].volume.grid)
 
     def _cut(self, normal: str, grid: Grid) -> None:
         along = grid.axis(normal)
@@ -92,11 +89,10 @@ class SlicesView:
             for number, panel in enumerate(self.panels):
                 aspect = slice_aspect(panel.volume, normal)
                 with ui.element("figure"):
-                    image = ui.element("img").style(f"aspect-ratio: {aspect:.4f}; --aspect: {aspect:.4f}")
-                    self._images[normal, number] = image
+                    style = f"aspect-ratio: {aspect:.4f}; --aspect: {aspect:.4f}"
+                    self._images[normal, number] = image().style(style)
                     title = f"{panel.title}; " if len(self.panels) > 1 else ""
-                    text = escape(f"{title}{slice_axes(grid.box, normal)}")
-                    ui.html(f"<figcaption>{text}</figcaption>", sanitize=False)
+                    html(escape(f"{title}{slice_axes(grid.box, normal)}"), "figcaption")
 
     def _index(self, normal: str) -> int:
         count = self.panels[0].volume.grid.shape["zyx".index(normal)]
@@ -112,18 +108,14 @@ class SlicesView:
                 normal = self._queue.pop()
                 panels, index = self.panels, self._index(normal) if self.panels else 0
                 addresses = await self.work.in_thread(_slice_addresses, panels, normal, index)
-                if panels is self.panels:
-                    self._put(normal, index, addresses)
+                if panels is not self.panels:
+                    continue
+                for number, (panel, address) in enumerate(zip(panels, addresses, strict=True)):
+                    at = float(panel.volume.grid.axis(normal)[index])
+                    text = f"{panel.title}, slice at {normal} = {at:.2f} mm"
+                    self._images[normal, number].props.update({"src": address, "alt": text})
         finally:
             self._busy = False
-
-    def _put(self, normal: str, index: int, addresses: Sequence[str]) -> None:
-        for number, (panel, address) in enumerate(zip(self.panels, addresses, strict=True)):
-            at = float(panel.volume.grid.axis(normal)[index])
-            image = self._images[normal, number]
-            image.props["src"] = address
-            image.props["alt"] = f"{panel.title}, slice at {normal} = {at:.2f} mm"
-            image.update()
 
 
 def _slice_addresses(panels: Sequence[Panel], normal: str, index: int) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
@@ -10,6 +11,7 @@ from typing import Any
 import numpy as np
 from nicegui import ui
 
+from nerif.app.forms.elements import html
 from nerif.app.forms.sliders import RangeSlider
 from nerif.app.views.routes import bodies_address, live_address, surface_address
 from nerif.common.conventions import unit_shown
@@ -59,12 +61,6 @@ class BoxScene:
         self.scene.move_camera(6.0, -6.9, 3.9, 0, 0, -0.3, duration=0)
         self._edges()
 
-    def name(self, label: str) -> None:
-        """Describe the scene for screen readers."""
-        if self.scene.props.get("aria-label") != label:
-            self.scene.props["aria-label"] = label
-            self.scene.update()
-
     def clear(self) -> None:
         """Remove all surfaces; the box stays."""
         self.scene.clear()
@@ -77,15 +73,11 @@ class BoxScene:
             return surface.move(*(-c * self._scale for c in self.box.centre))
 
     def _edges(self) -> None:
-        lower, upper, centre = self.box.lower, self.box.upper, self.box.centre
-        corners = [
-            [((upper if i >> a & 1 else lower)[a] - centre[a]) * self._scale for a in range(3)] for i in range(8)
-        ]
+        ends = np.array(list(itertools.product((-0.5, 0.5), repeat=3))) * self.box.edges * self._scale
         with self.scene:
-            for i in range(8):
-                for a in range(3):
-                    if not i >> a & 1:
-                        self.scene.line(corners[i], corners[i | 1 << a]).material(EDGE)
+            for a, b in itertools.combinations(ends, 2):
+                if np.count_nonzero(a != b) == 1:
+                    self.scene.line(a.tolist(), b.tolist()).material(EDGE)
 
 
 @dataclass(frozen=True)
@@ -129,20 +121,17 @@ class SurfaceView:
         async def move(_: int) -> None:
             self._draw()
 
-        label = f"Level{f', {unit}' if unit else ''}"
-        self._slider = RangeSlider(label, STEPS, min(max(step, 1), STEPS - 1), self._text, move, on_release=True)
-        self._legend = ui.html("", sanitize=False)
+        self._slider = RangeSlider(
+            f"Level{f', {unit}' if unit else ''}", STEPS, min(max(step, 1), STEPS - 1),
+            lambda step: f"{self._level(step):.4g}", move, on_release=True,
+        )  # fmt: skip
+        self._legend = html()
         self.scene = BoxScene(box, "Isosurface; drag to turn, scroll to zoom")
 
-    @property
-    def level(self) -> float:
-        """The current level, in the unit of the quantity."""
+    def _level(self, step: int) -> float:
+        """The level of a step of the slider, in the unit of the quantity."""
         low, high = self.limits
-        return low + (high - low) * self._slider.value / STEPS
-
-    def _text(self, step: int) -> str:
-        low, high = self.limits
-        return f"{low + (high - low) * step / STEPS:.4g}"
+        return low + (high - low) * step / STEPS
 
     def show(self, surfaces: Sequence[Surface]) -> None:
         """Replace the surfaces."""
@@ -151,16 +140,14 @@ class SurfaceView:
 
     def _draw(self) -> None:
         self.scene.clear()
+        names, level = "", self._level(self._slider.value)
         for surface, (colour, opacity) in zip(self.surfaces, COLOURS, strict=False):
-            address = surface_address(surface.name, self.quantity, self.level, surface.frame, surface.stamp)
+            address = surface_address(surface.name, self.quantity, level, surface.frame, surface.stamp)
             self.scene.add(address, colour, opacity)
-        for surface in self.surfaces[:1]:
-            if surface.bodies:
-                self.scene.add(bodies_address(surface.name, surface.stamp), BODY)
-        names = "".join(
-            f"<li><i style='background:{colour};opacity:{opacity}'></i>{escape(surface.title)}</li>"
-            for surface, (colour, opacity) in zip(self.surfaces, COLOURS, strict=False)
-        )
+            style = f"background:{colour};opacity:{opacity}"
+            names += f"<li><i style='{style}'></i>{escape(surface.title)}</li>"
+        if self.surfaces and self.surfaces[0].bodies:
+            self.scene.add(bodies_address(self.surfaces[0].name, self.surfaces[0].stamp), BODY)
         self._legend.set_content(f"<ul class=legend>{names}</ul>")
 
 
@@ -191,11 +178,11 @@ class LiveSurface:
             self.clear()
             with self.place:
                 self._scene = BoxScene(box, caption, LIVE_SIZE)
-                self._caption = ui.html("", sanitize=False)
+                self._caption = html()
         for surface in self._surfaces[:-1]:  # the previous one stays until the new one is loaded
             surface.delete()
         self._surfaces = [*self._surfaces[-1:], self._scene.add(live_address(name, stamp), COLOURS[0][0])]
-        self._scene.name(f"{caption} Drag to turn, scroll to zoom.")
+        self._scene.scene.props["aria-label"] = f"{caption} Drag to turn, scroll to zoom."
         self._caption.set_content(f"<figcaption>{escape(caption)}</figcaption>")
 
 

@@ -22,17 +22,17 @@ QUANTILE = 0.995  # of the values, within the colour range
 
 def maps_html(measurement: Measurement) -> str:
     """Return a row of maps for each view as HTML: components of the signal, sigma, valid pixels."""
-    (observation, *_), parts = integrals_of(measurement), []
+    observation, *_ = integrals_of(measurement)
     usable = measurement.usable_for(observation)
-    values = observation.values.where(usable[..., None], torch.tensor(float("nan")))
+    values = observation.values.where(usable[..., None], torch.nan)
     most = _largest(values.abs())
     least = -most if observation.signed else 0.0
-    sigma = None if observation.sigma is None else observation.sigma[..., 0].where(usable, torch.tensor(float("nan")))
+    sigma = None if observation.sigma is None else observation.sigma[..., 0].where(usable, torch.nan)
     noisiest = 1.0 if sigma is None else _largest(sigma)
     unit = escape(observation.technique.unit)
     scale = f"Colours from {least:.3g} to {most:.3g} {unit} in all views"
     scale += "; grey: not valid." if sigma is None else f", of sigma from 0 to {noisiest:.3g} {unit}; grey: not valid."
-    parts.append(f"<p class=note>{scale}</p>")
+    parts = [f"<p class=note>{scale}</p>"]
     for i, (camera, share) in enumerate(zip(measurement.cameras, measurement.valid_share(observation), strict=True)):
         part = _pixels(i, camera, PIXELS)
         images = {
@@ -43,15 +43,15 @@ def maps_html(measurement: Measurement) -> str:
             images["sigma"] = image_address(sigma[part].numpy(), (0.0, noisiest), "viridis")
         images["valid"] = image_address(usable[part].numpy().astype(float), (0.0, 1.0), "gray")
         row = images_html([(address, f"{name} of view {camera.name}", name) for name, address in images.items()])
-        heading = f"{escape(camera.name)}, {share:.1%} valid pixels ({observation.technique.data_name()})"
-        parts.append(f"<h3>{heading}</h3>{row}")
+        data = observation.technique.data_name()
+        parts.append(f"<h3>{escape(camera.name)}, {share:.1%} valid pixels ({data})</h3>{row}")
     return "".join(parts)
 
 
 def magnitude_address(measurement: Measurement, view: int) -> str:
     """Return the magnitude of the signal of a view as an image."""
     (observation, *_), part = integrals_of(measurement), _pixels(view, measurement.cameras[view], 3 * PIXELS)
-    size = observation.values[part].norm(dim=-1).where(measurement.usable[part], torch.tensor(float("nan")))
+    size = observation.values[part].norm(dim=-1).where(measurement.usable[part], torch.nan)
     return image_address(size.numpy(), (0.0, _largest(size)), "viridis")
 
 
