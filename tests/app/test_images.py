@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from app.visiting import visiting
-from nerif.app.project.folder import ProjectFolder
+from nerif.app.project.folder import CACHED, ProjectFolder
 from nerif.app.project.image_cache import ImageCache
 from nerif.app.views.edits import Edits
 from nerif.imaging.readers.crop import Crop
@@ -67,7 +67,7 @@ async def test_what_is_wrong_is_named_and_a_crop_is_typed_undone_kept_and_writte
 def test_images_are_kept_until_their_files_change(folder, monkeypatch):
     files, path = ImageCache(ProjectFolder(folder)), folder / "run" / "cam3" / "reference"
     view = next(v for v in find_views(folder / "run") if v.name == "cam3")
-    monkeypatch.setattr("nerif.app.project.image_cache.LIMIT", 2)
+    monkeypatch.setitem(CACHED, "image", 2)
 
     def image(number: int, largest: int = 280) -> str:
         return files.image(view, "reference", number, largest, None)

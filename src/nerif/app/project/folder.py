@@ -8,7 +8,7 @@ from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Lock
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from nerif.common.conventions import InputError
 from nerif.common.files import ending
@@ -23,7 +23,7 @@ __all__ = ["OWN", "Contents", "ProjectFolder"]
 DEPTH = 3  # levels of folders that are searched
 LIMIT = 20_000  # entries that are searched
 OWN = ".nerif"
-CACHED = {"measurement": 2}  # whole files; of other entries, which are a few lines each, LIMIT
+CACHED = {"measurement": 2, "image": 400}  # large entries; of others, which are a few lines each, LIMIT
 
 T = TypeVar("T")
 
@@ -62,7 +62,7 @@ class ProjectFolder:
         if not self.folder.is_dir():
             got = "a file" if self.folder.exists() else "none"
             raise InputError(f"expected a folder to work in, got {got}", field=folder)
-        self._cache: dict[str, OrderedDict[Path, tuple[tuple[int, int], object]]] = {}
+        self._cache: dict[str, OrderedDict[Any, tuple[Any, Any]]] = {}
         self._lock = Lock()  # pages use the cache in threads
 
     @property
@@ -111,18 +111,21 @@ class ProjectFolder:
         """Return `read` of a file, cached under `what` until the file changes, or many others have been used since."""
         path = self.path(name)
         status = path.stat()
-        stamp, limit = (status.st_mtime_ns, status.st_size), CACHED.get(what, LIMIT)
+        return self.cached(what, path, (status.st_mtime_ns, status.st_size), lambda: read(path))
+
+    def cached(self, what: str, key: Any, stamp: Any, read: Callable[[], T]) -> T:
+        """Return `read()`, cached until the stamp changes, or many others of the same sort have been used since."""
         with self._lock:
             cache = self._cache.setdefault(what, OrderedDict())  # least recently used first
-            entry = cache.get(path)
+            entry = cache.get(key)
         if entry is None or entry[0] != stamp:
-            entry = (stamp, read(path))
+            entry = (stamp, read())
         with self._lock:
-            cache[path] = entry
-            cache.move_to_end(path)
-            while len(cache) > limit:
+            cache[key] = entry
+            cache.move_to_end(key)
+            while len(cache) > CACHED.get(what, LIMIT):
                 cache.popitem(last=False)
-        return entry[1]  # type: ignore[return-value]
+        return entry[1]  # type: ignore[no-any-return]
 
     def contents(self) -> Contents:
         """Search the folder."""

@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections import OrderedDict
-from collections.abc import Sequence
-from pathlib import Path
-from threading import Lock
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
 
 from nerif.app.project.folder import ProjectFolder
 from nerif.common.conventions import InputError
@@ -19,7 +16,8 @@ from nerif.imaging.readers.views import View
 
 __all__ = ["ImageCache"]
 
-LIMIT = 400  # of the cache, entries
+T = TypeVar("T")
+
 SAMPLE = 12  # images of a source whose quality is read
 
 
@@ -33,8 +31,6 @@ class ImageCache:
 
     def __init__(self, project: ProjectFolder) -> None:
         self.project = project
-        self._cache: OrderedDict[tuple[Any, ...], Any] = OrderedDict()  # least recently used first
-        self._lock = Lock()  # pages use the cache in threads
 
     def stamp(self, view: View, source: str) -> tuple[Any, ...]:
         """Return a value that changes with the files of a source."""
@@ -43,9 +39,7 @@ class ImageCache:
         where = path if path.exists() else path.parent
         if not where.resolve().is_relative_to(self.project.folder):
             raise InputError(f"expected images in {self.project.folder}, got some outside of it", field=name)
-        result = (
-            [os.stat(where), *(entry.stat() for entry in os.scandir(where))] if where.is_dir() else [os.stat(where)]
-        )
+        result = [os.stat(where), *(entry.stat() for entry in (os.scandir(where) if where.is_dir() else ()))]
         return len(result), max(f.st_mtime_ns for f in result), sum(f.st_size for f in result)
 
     def quality(self, view: View, source: str) -> ImageQuality:
@@ -76,16 +70,6 @@ class ImageCache:
         what = ("explanation", tuple(numbers), target)
         return self._from_cache(view, source, what, lambda: explain_missing(view, source, target, numbers))
 
-    def _from_cache(self, view: View, source: str, what: tuple[Any, ...], read: Any) -> Any:
-        key = str(Path(view.folder)), view.name, view.sources.get(source), source, view.crop, view.mosaic, what
-        stamp = self.stamp(view, source) if source in view.sources else ()
-        with self._lock:
-            entry = self._cache.get(key)
-        if entry is None or entry[0] != stamp:
-            entry = (stamp, read())
-        with self._lock:
-            self._cache[key] = entry
-            self._cache.move_to_end(key)
-            while len(self._cache) > LIMIT:
-                self._cache.popitem(last=False)
-        return entry[1]
+    def _from_cache(self, view: View, source: str, what: tuple[Any, ...], read: Callable[[], T]) -> T:
+        key = str(view.folder), view.name, view.sources.get(source), source, view.crop, view.mosaic, what
+        return self.project.cached("image", key, self.stamp(view, source) if source in view.sources else (), read)
