@@ -10,9 +10,8 @@ from typing import Any
 
 import pytest
 
-from app.serving import Served, opened
+from app.serving import opened
 from nerif.app.pages import PAGES
-from nerif.app.pages.page import Page
 from nerif.app.project.demo_project import MARK
 from report.browsing import errors, needs_browser, requests, wait_for
 
@@ -62,36 +61,29 @@ def settled(driver: Any) -> None:
                      ".iterations === Infinity)")  # fmt: skip
 
 
-def seen(driver: Any, server: Served, page: Page, size: tuple[int, int], dark: bool) -> list[Any]:
-    """Open a page once all of it is there, and return the rules that it breaks."""
+def windowed(driver: Any, size: tuple[int, int], dark: bool) -> None:
+    """Give the browser a window of a size, and a system that is light or dark."""
     scheme = [{"name": "prefers-color-scheme", "value": "dark" if dark else "light"}]
+    metrics = {"width": size[0], "height": size[1], "deviceScaleFactor": 1, "mobile": False}
     driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": scheme})
-    driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics(*size))
-    opened(driver, server, page.path.lstrip("/"), THERE[page.name])
+    driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics)
+
+
+def faults(driver: Any, dark: bool) -> list[Any]:
+    """Rules that the open page breaks, and elements that do not fit."""
     wait_for(driver, f"return document.body.classList.contains('body--dark') === {str(dark).lower()}")
     settled(driver)
     driver.execute_script(axe())
-    return list(driver.execute_async_script(RULES))
+    found = list(driver.execute_async_script(RULES))
+    wide = driver.execute_script("return document.documentElement.scrollWidth - document.documentElement.clientWidth")
+    return [*found, *driver.execute_script(CUT), *([f"{wide} px too wide"] if wide > 0 else [])]
 
 
-CASES = [
-    pytest.param(LAPTOP, False, id="laptop, light"),
-    pytest.param(LARGE, True, id="4K, dark", marks=pytest.mark.slow),
-    pytest.param(LAPTOP, True, id="laptop, dark", marks=pytest.mark.slow),
-    pytest.param(LARGE, False, id="4K, light", marks=pytest.mark.slow),
-    pytest.param(PHONE, False, id="phone, light", marks=pytest.mark.slow),
-    pytest.param(PHONE, True, id="phone, dark", marks=pytest.mark.slow),
-    pytest.param(TABLET, True, id="tablet, dark", marks=pytest.mark.slow),
-]  # fmt: skip
-
-
-@pytest.mark.parametrize(("size", "dark"), CASES)
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_a_page_breaks_no_rule_fits_and_asks_nobody_else(browser, server, page, size, dark):
-    assert seen(browser, server, page, size, dark) == []
-    wide = browser.execute_script("return document.documentElement.scrollWidth - document.documentElement.clientWidth")
-    assert wide <= 0
-    assert browser.execute_script(CUT) == []
+def test_a_page_breaks_no_rule_fits_and_asks_nobody_else(browser, server, page):
+    windowed(browser, LAPTOP, False)
+    opened(browser, server, page.name, THERE[page.name])
+    assert faults(browser, False) == []
     counts = "return arguments[0].map(e => document.querySelectorAll(e).length)"
     assert browser.execute_script(counts, LANDMARKS) == [1] * len(LANDMARKS)
     assert errors(browser) == []
@@ -99,9 +91,15 @@ def test_a_page_breaks_no_rule_fits_and_asks_nobody_else(browser, server, page, 
     assert [address for address in requests(browser) if not address.startswith(here)] == []
 
 
-def metrics(width: int, height: int) -> dict[str, Any]:
-    """A window of that size."""
-    return {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
+@pytest.mark.slow
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_a_page_breaks_no_rule_in_any_window(browser, server, page):
+    windowed(browser, PHONE, False)
+    opened(browser, server, page.name, THERE[page.name])
+    for size, dark in ((PHONE, False), (PHONE, True), (TABLET, True), (LAPTOP, True), (LARGE, True), (LARGE, False)):
+        windowed(browser, size, dark)
+        assert faults(browser, dark) == [], (size, dark)
+    assert errors(browser) == []
 
 
 def test_a_broken_rule_is_found(browser, server):
@@ -115,6 +113,7 @@ def test_a_page_is_used_without_a_mouse(browser, server):
     """The first key leads past the navigation; then controls come in their order, and are seen to have the focus."""
     from selenium.webdriver.common.keys import Keys
 
+    windowed(browser, LAPTOP, False)
     opened(browser, server, "design", THERE["design"])
     browser.find_element("tag name", "body").send_keys(Keys.TAB)
     assert browser.execute_script("return document.activeElement.className") == "skip"
@@ -133,14 +132,15 @@ def test_a_page_is_used_without_a_mouse(browser, server):
     ]  # fmt: skip
 
 
-@pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
-def test_a_hint_breaks_no_rule_on_a_phone(browser, server, dark):
-    """The page is that of a demo project for as long as the mark is there."""
+def test_a_hint_breaks_no_rule_on_a_phone(browser, server):
+    """The project is that of a demo for as long as the mark is there."""
     (server.folder / MARK).write_text('{"complete": true}')
-    page = next(page for page in PAGES if page.name == "displacement")
-    assert seen(browser, server, page, PHONE, dark) == []
-    assert browser.execute_script("return document.querySelector('.guide')?.checkVisibility()")
-    assert browser.execute_script(CUT) == []
+    for dark in (False, True):
+        windowed(browser, PHONE, dark)
+        if not dark:
+            opened(browser, server, "displacement", THERE["displacement"])
+        assert faults(browser, dark) == []
+    assert browser.execute_script("return document.querySelector('.guide').checkVisibility()")
     covered = browser.execute_script("return document.querySelector('nav').getBoundingClientRect().right")
     assert covered <= 0  # the navigation does not lie over the page
     (server.folder / MARK).unlink()

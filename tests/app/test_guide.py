@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from app.projects import result
 from app.visiting import visiting
 from nerif.app.forms.form import Form
 from nerif.app.pages import PAGES
@@ -55,37 +54,30 @@ def renders(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
     return folders
 
 
-def test_a_new_folder_is_filled_once(tmp_path, renders, capsys):
-    demo.fill(tmp_path / "a" / "b")
-    assert renders == [tmp_path / "a" / "b" / "images"]
-    assert demo.is_demo(tmp_path / "a" / "b")
-    assert not (tmp_path / "a" / "b" / "images" / "truth" / "calibration.toml").exists()
-    assert "rendering" in capsys.readouterr().out
-    demo.fill(tmp_path / "a" / "b")
-    assert len(renders) == 1
-    assert "earlier start" in capsys.readouterr().out
+def test_a_new_folder_is_filled_once_also_after_an_interruption(tmp_path, renders, monkeypatch, capsys):
+    folder = tmp_path / "a" / "b"
 
-
-def test_a_start_that_was_interrupted_is_repeated(tmp_path, renders, monkeypatch):
     def interrupted(folder: Path) -> None:
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
         patch.setattr(demo, "render", interrupted)
         with pytest.raises(KeyboardInterrupt):
-            demo.fill(tmp_path)
-    demo.fill(tmp_path)
-    assert len(renders) == 1
-    assert json.loads((tmp_path / demo.MARK).read_text()) == {"complete": True}
+            demo.fill(folder)
+    for said in ("rendering", "earlier start"):
+        demo.fill(folder)
+        assert said in capsys.readouterr().out
+    assert renders == [folder / "images"]
+    assert demo.is_demo(folder)
+    assert json.loads((folder / demo.MARK).read_text()) == {"complete": True}
+    assert not (folder / "images" / "truth" / "calibration.toml").exists()
 
 
 def test_a_folder_that_holds_something_else_is_left_alone(tmp_path, renders, capsys):
     (tmp_path / "thesis.tex").write_text("x")
-    with refused(tmp_path) as error:
-        demo.fill(tmp_path)
-    assert "thesis.tex" in str(error.value)
-    with refused(tmp_path / "thesis.tex"):
-        demo.fill(tmp_path / "thesis.tex")
+    for folder in (tmp_path, tmp_path / "thesis.tex"):
+        with refused(folder):
+            demo.fill(folder)
     assert main(["app", str(tmp_path), "--demo", "--no-browser"]) == 2
     assert "new or an empty folder" in capsys.readouterr().err
     assert renders == []
@@ -133,33 +125,27 @@ def test_states_follow_the_files(tmp_path, project):
     folder = marked(tmp_path / "demo")
     work, pages = Workspace(ProjectFolder(folder)), {page.name: page for page in PAGES}
 
-    def sentence(name: str) -> str:
-        return state(work, pages[name], PAGES)[0]
+    def states(*names: str) -> list[str]:
+        """What the guide says on pages, and where its link leads."""
+        found = [state(work, pages[name], PAGES) for name in names]
+        return [f"{sentence} {word} {page.name if page else ''}".strip() for sentence, word, page in found]
 
-    def after(name: str) -> tuple[str, str]:
-        _, word, page = state(work, pages[name], PAGES)
-        return word, page.name if page else ""
-
-    assert sentence("design") == sentence("images") == ""
-    assert sentence("calibration") == "Not done yet."
-    assert sentence("displacement") == "First complete the step Calibration."
-    assert after("displacement") == ("Back to", "calibration")
-    assert sentence("results") == "First complete the step Reconstruct."
+    assert states("design", "images") == ["Next: images", "Next: calibration"]
+    assert states("calibration", "displacement", "results") == [
+        "Not done yet. Next: displacement", "First complete the step Calibration. Back to calibration",
+        "First complete the step Reconstruct. Back to reconstruct",
+    ]  # fmt: skip
     shutil.copy(project / "made.toml", folder / "calibration.toml")
-    assert sentence("calibration") == "Done."
-    assert sentence("displacement") == "Not done yet."
-    assert after("displacement") == ("Next:", "check")
+    assert states("calibration", "displacement") == ["Done. Next: displacement", "Not done yet. Next: check"]
     shutil.copy(project / "m.nc", folder / "measurement.nc")
-    assert sentence("displacement") == "Done."
-    assert sentence("check") == sentence("reconstruct") == "Not done yet."
+    assert states("displacement", "check") == ["Done. Next: check", "Not done yet. Next: reconstruct"]
     (folder / ".nerif" / "checks").mkdir()
     (folder / findings_file("measurement.nc")).write_text("{}")
-    assert sentence("check") == "Done."
     ResultDirectory(folder / "results" / "a").begin({"method": "nerif"})
-    assert sentence("reconstruct") == "Not done yet."
-    result(folder / "results" / "b", 8, 0.0)
-    assert sentence("reconstruct") == "Done."
-    assert sentence("results").startswith("This was the last page")
+    assert states("check", "reconstruct") == ["Done. Next: reconstruct", "Not done yet. Next: results"]
+    shutil.copytree(project / "results" / "other", folder / "results" / "b")
+    assert states("reconstruct", "results")[0] == "Done. Next: results"
+    assert states("results")[0].startswith("This was the last page")
     more = Page("more", "More", "A page without a hint.", lambda work: None)
     assert state(work, PAGES[0], (*PAGES, more))[2] is PAGES[1]
 

@@ -26,7 +26,6 @@ from nerif.data.volume import FORMATS
 
 __all__ = ["PAGE"]
 
-VERBS: dict[type, str] = {Export: "export", Figures: "figures", MovieCommand: "movie"}
 TABS = {"slices": "Slices", "surface": "In 3-D", "report": "Report", "export": "Export"}
 PROGRAMS = {
     ".vti": "ParaView (.vti)", ".nc": "NetCDF (.nc)", ".npz": "NumPy (.npz)", ".mat": "MATLAB (.mat)",
@@ -144,38 +143,42 @@ class ResultsPage:
                 with card("A movie", f"Every frame drawn off-screen; needs {install('movie')}."):
                     movie = MovieCommand(MISSING, MISSING)
                     formats = {".mp4": "H.264 (.mp4)", ".gif": "GIF (.gif)"}
-                    self._file_form(movie, formats, "Make the movie", ("style", "every"))
+                    self._file_form("movie", movie, formats, "Make the movie", ("style", "every"))
                 return
             with card("The field, for other programs", "On any grid: a network has no voxels of its own."):
                 formats = {ending: PROGRAMS.get(ending, ending) for ending in FORMATS}
-                self._file_form(Export(MISSING, MISSING), formats, "Export", ("voxels", "quantities"))
+                record = Export(MISSING, MISSING)
+                self._file_form("export", record, formats, "Export", ("voxels", "quantities"))
             note = "Vector PDF and PNG, as wide as the columns of a journal."
             with card("Figures for print", note), ui.element("div").classes("form"):
                 text_html(f"They are written to {self.row.title}/figures.", classes="note")
-                self._form(Figures(MISSING), lambda: ["figures", self.row.name], "Draw the figures")
+                self._form("figures", Figures(MISSING), lambda: [], "Draw the figures")
 
-    def _file_form(self, record: Any, formats: Mapping[str, str], button: str, main: Sequence[str]) -> None:
+    def _file_form(
+        self, verb: str, record: Any, formats: Mapping[str, str], button: str, main: Sequence[str]
+    ) -> None:
         """Build the form of a command that writes a file, with a choice of its format that changes its name."""
 
         def name_with(ending: str) -> str:
             return self.work.project.free_name(f"exports/{PurePosixPath(self.row.title).stem}{ending}")
 
-        def words() -> list[str]:
-            return [VERBS[type(record)], self.row.name, "-o", word_of(name.value or "FILE")]
-
         with ui.element("div").classes("form"):
             choice = select("Format", dict(formats))
             name = text_field("File to write", name_with(choice.value))
-            job_form = self._form(record, words, button, main, lambda: name.value)
+            job_form = self._form(
+                verb, record, lambda: ["-o", word_of(name.value or "FILE")], button, main, lambda: name.value
+            )
         choice.on_value_change(lambda: name.set_value(name_with(choice.value)))
         name.on_value_change(job_form.show)
 
     def _form(
-        self, record: Any, words: Callable[[], list[str]], button: str, main: Sequence[str] = (),
+        self, verb: str, record: Any, words: Callable[[], list[str]], button: str, main: Sequence[str] = (),
         out: Callable[[], str] | None = None,
     ) -> JobForm:  # fmt: skip
-        form, name = Form(record, without=("config", "result", "out", "force")), f"{PAGE.name}.{VERBS[type(record)]}"
-        return JobForm(self.work, name, form, words, button, main, out, subject=self.row.name)
+        form, name = Form(record, without=("config", "result", "out", "force")), self.row.name
+        return JobForm(
+            self.work, f"{PAGE.name}.{verb}", form, lambda: [verb, name, *words()], button, main, out, subject=name
+        )  # fmt: skip
 
 
 async def build(work: Workspace) -> None:

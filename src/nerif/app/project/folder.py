@@ -125,7 +125,7 @@ class ProjectFolder:
             cache.move_to_end(key)
             while len(cache) > CACHED.get(what, LIMIT):
                 cache.popitem(last=False)
-        return entry[1]  # type: ignore[no-any-return]
+        return entry[1]
 
     def contents(self) -> Contents:
         """Search the folder."""
