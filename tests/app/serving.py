@@ -2,24 +2,17 @@
 
 from __future__ import annotations
 
-import atexit
 import http.client
-import json
 import os
 import re
-import select
-import signal
 import socket
 import subprocess
 import sys
-import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager, suppress
-from dataclasses import dataclass, replace
-from functools import cache
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import IO, Any
+from typing import Any
 
 from report.browsing import wait_for
 
@@ -32,18 +25,16 @@ class Served:
 
     Parameters
     ----------
+    folder : of the project
     link : address with the token
     port : that it listens on
-    pid : number of its process
     said : its first lines
-    folder : of the project
     """
 
+    folder: Path
     link: str
     port: int
-    pid: int
     said: str
-    folder: Path = Path()
 
     @property
     def token(self) -> str:
@@ -76,63 +67,28 @@ def outside() -> dict[str, str]:
     return {**known, "PYTHONUNBUFFERED": "1", "OMP_NUM_THREADS": "1"}
 
 
-@cache
-def nursery() -> subprocess.Popen[str]:
-    """The process that forks servers, as long as these tests go on."""
-    words = [sys.executable, str(Path(__file__).with_name("nursery.py"))]
-    process = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=outside())
-
-    def end() -> None:
-        process.communicate(timeout=20)
-
-    atexit.register(end)
-    return process
-
-
-def forked(words: Sequence[str], out: Path, by: Sequence[str] = ()) -> tuple[int, IO[str]]:
-    """Let the nursery start `nerif ...`: process number, and what it prints."""
-    process = nursery()
-    assert process.stdin is not None
-    assert process.stdout is not None
-    os.mkfifo(out)
-    process.stdin.write(json.dumps({"words": list(words), "out": str(out), "by": list(by)}) + "\n")
-    process.stdin.flush()
-    return int(process.stdout.readline()), out.open()
-
-
 @contextmanager
-def served(folder: Path, *arguments: str, port: int | None = None, by: Sequence[str] = ()) -> Iterator[Served]:
+def served(folder: Path, *arguments: str, by: Sequence[str] = (), cwd: Path | None = None) -> Iterator[Served]:
     """Start nerif app on a folder, by way of another command if one is given, and end it by force."""
-    words = ["app", str(folder), "--no-browser", "--port", str(port or free_port()), *arguments]
-    with TemporaryDirectory() as place:
-        pid, printed = forked(words, Path(place) / "out", by)
-        with printed:
-            try:
-                yield replace(answering(pid, printed), folder=folder)
-            finally:
-                end(pid, printed)
+    words = [*by, sys.executable, "-P", "-m", "nerif", "app", str(folder), "--no-browser", "--port", str(free_port())]
+    with subprocess.Popen(
+        [*words, *arguments], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=outside(), cwd=cwd
+    ) as process:
+        assert process.stdout is not None
+        try:
+            yield answering(folder, process.stdout)
+        finally:
+            process.kill()
 
 
-def answering(pid: int, printed: Iterable[str]) -> Served:
+def answering(folder: Path, printed: Iterable[str]) -> Served:
     """Wait until a server says that it answers."""
     said = ""
     for line in printed:
         said += line
         if found := re.search(r"http://[^:]+:(\d+)/\?token=\S+", line):
-            return Served(found[0], int(found[1]), pid, said)
+            return Served(folder, found[0], int(found[1]), said)
     raise AssertionError(f"it did not start: {said}")
-
-
-def end(pid: int, printed: IO[str]) -> None:
-    """End a server at once; one that has ended is left alone."""
-    with suppress(ProcessLookupError):
-        os.kill(pid, signal.SIGKILL)
-    until = time.monotonic() + 20
-    while time.monotonic() < until:
-        ready, _, _ = select.select([printed], [], [], 0.2)
-        if ready and not os.read(printed.fileno(), 65536):  # nobody can write into it any more
-            return
-    raise AssertionError(f"process {pid} does not end")
 
 
 def opened(driver: Any, server: Served, page: str, ready: str) -> None:

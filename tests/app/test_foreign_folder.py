@@ -15,7 +15,7 @@ from types import SimpleNamespace
 import pytest
 from nicegui import Client, ui
 
-from app.serving import answering, end, free_port, outside
+from app.serving import outside, served
 from app.visiting import visiting
 from nerif.app.forms.elements import card
 from nerif.app.forms.sliders import RangeSlider
@@ -58,16 +58,8 @@ def test_the_app_runs_nothing_of_a_folder_and_its_users_run_nonetheless(tmp_path
     plant(tmp_path)
     jobs = Jobs(tmp_path)
     own_job = jobs.add(("info", "m.nc"), "own").id
-    words = [sys.executable, "-P", "-m", "nerif", "app", ".", "--no-browser", "--port", str(free_port())]
-    with subprocess.Popen(
-        words, cwd=tmp_path, env=outside(), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-    ) as server:
-        assert server.stdout is not None
-        try:
-            answering(server.pid, server.stdout)
-            assert ended(jobs, own_job) == "failed"  # there is no m.nc
-        finally:
-            end(server.pid, server.stdout)
+    with served(Path("."), cwd=tmp_path):
+        assert ended(jobs, own_job) == "failed"  # there is no m.nc
     assert "m.nc" in jobs.log(own_job)[-1]
     assert jobs.get("planted").state == "held"
     assert not (jobs.directory / "planted" / "log.txt").exists()

@@ -212,7 +212,7 @@ def test_a_browser_is_led_in_without_the_token_on_its_command_line_and_ctrl_c_en
         words, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment
     ) as process:
         assert process.stdout is not None
-        served = answering(process.pid, process.stdout)
+        served = answering(tmp_path, process.stdout)
         until = time.monotonic() + 20
         while not started.is_file():
             assert time.monotonic() < until
