@@ -69,9 +69,9 @@ async def test_a_mirrored_view_is_found_and_undone(folder):
         assert user.lines()[0] == ["nerif", *words]
         user.click("Compare the views")
         assert user.work.jobs.all()[0].arguments == tuple(words)
-        await user.sees_soon("the image is mirrored left to right", seconds=120)
+        await user.sees_soon("the image is mirrored left to right")
         user.click("Correct the mistakes")
-        await user.sees_soon("Go on with bad.corrected.nc", seconds=120)
+        await user.sees_soon("Go on with bad.corrected.nc")
         found, good = Measurement.read(folder / "bad.corrected.nc"), Measurement.read(folder / "good.nc")
         torch.testing.assert_close(found.displacement, good.displacement)
         user.click("Go on with bad.corrected.nc")

@@ -95,7 +95,7 @@ def test_keys_of_the_brush_act_in_the_editor_alone_and_an_undo_shows_its_view(br
 def test_a_crop_is_drawn_and_reference_and_flow_change_places_by_key_and_clock(browser, server):
     from selenium.webdriver.common.keys import Keys
 
-    opened(browser, server, "images", "document.querySelector('.both img.flow')?.complete")
+    opened(browser, server, "images", "document.querySelector('.both img.flow')?.naturalWidth > 0")
     drag(browser, ".cropper", 100, 60)
     wait_for(browser, "return Number(document.querySelector('input[name=width]').value) < 96")
     both = browser.find_element("css selector", ".both")

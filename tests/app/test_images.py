@@ -38,9 +38,9 @@ async def test_what_is_wrong_is_named_and_a_crop_is_typed_undone_kept_and_writte
         await user.until(lambda: len([e for e in user.all(loading="lazy") if e.tag == "img"]) == 5)
         assert user.html.count("class=histogram") == 5
         assert user.sees("0.00% saturated")
-        user.fire(next(e for e in user.all() if "cropper" in e.classes), "pointerdown", [0.25, 0.25, 0.5, 0.5])
+        user.fire(next(e for e in user.all() if "cropper" in e.classes), "pointerdown", [0.25, 0.125, 0.5, 0.375])
         await user.until(lambda: user.control("column").value == 24)
-        assert [user.control(name).value for name in ("row", "width", "height")] == [16, 24, 16]
+        assert [user.control(name).value for name in ("row", "width", "height")] == [8, 24, 16]
         for label, column in (("Undo", 0), ("Redo", 24)):
             user.click(label)
             await user.until(lambda column=column: user.control("column").value == column)
@@ -56,7 +56,7 @@ async def test_what_is_wrong_is_named_and_a_crop_is_typed_undone_kept_and_writte
         user.click("Save to views.toml")
         await user.sees_soon("run/views.toml is written.", "The commands see the views")
         crops = {view.name: view.crop for view in find_views(folder / "run")}
-        assert crops == {"cam1": Crop(row=16, column=24, height=16, width=20), "cam <2>": None, "cam3": None}
+        assert crops == {"cam1": Crop(row=8, column=24, height=16, width=20), "cam <2>": None, "cam3": None}
         await user.sees_soon("Look closer, crop, turn")
         for name in ("cam1", "cam <2>", "cam3"):  # the last one is shown large
             await user.until(lambda name=name: user.all(aria_label=f"Look closer at {name}, crop or turn it"))

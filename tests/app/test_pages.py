@@ -84,7 +84,7 @@ async def test_a_run_is_watched_paused_gone_on_with_by_another_server_and_stoppe
         assert user.lines()[0][:3] == ["nerif", "reconstruct", "m & <b>.nc"]
         user.put("time_limit", 600.0)
         user.click("Start")
-        await user.until(lambda: user.html.count("<img") >= 7, 120)
+        await user.until(lambda: user.html.count("<img") >= 7)
         assert user.all(ui.echart)
         await user.open("reconstruct")  # a reload loses nothing
         await user.until(lambda: user.html.count("<img") >= 7)
@@ -93,15 +93,15 @@ async def test_a_run_is_watched_paused_gone_on_with_by_another_server_and_stoppe
         assert found is not None
         assert found.view == read_live(out)["view"]
         user.click("Pause")
-        await user.sees_soon("Paused; the checkpoint is saved.", seconds=120)
+        await user.sees_soon("Paused; the checkpoint is saved.")
         assert (out / "checkpoint.safetensors").is_file() or (out / "cross_validation").is_dir()
         user.click("Go on")
-        await user.sees_soon("It runs.", ": step ", seconds=120)
+        await user.sees_soon("It runs.", ": step ")
         (job,) = user.work.jobs.all()
     async with visiting(small) as user:  # the server has ended, the run goes on
         await user.open("reconstruct")
         await user.sees_soon("It runs.", ": step ")
         assert [j.pid for j in user.work.jobs.all()] == [job.pid]
         user.click("Stop")
-        await user.sees_soon("Stopped", seconds=120)
+        await user.sees_soon("Stopped")
     assert (out / "volume.nc").is_file()

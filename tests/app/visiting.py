@@ -41,7 +41,7 @@ class Visitor:
         await self.user.open(f"/{page}")
         await self.until(lambda: self.sees(ready) if ready else self.all(ui.input))
 
-    async def until(self, condition: Callable[[], Any], seconds: float = 60.0) -> None:
+    async def until(self, condition: Callable[[], Any], seconds: float = 120.0) -> None:
         """Wait until a condition holds."""
         end = time.monotonic() + seconds
         while not condition():
@@ -71,7 +71,7 @@ class Visitor:
         """Whether all texts are on the page."""
         return all(text in self.text for text in texts)
 
-    async def sees_soon(self, *texts: str, seconds: float = 60.0) -> None:
+    async def sees_soon(self, *texts: str, seconds: float = 120.0) -> None:
         """Wait until all texts are on the page."""
         await self.until(lambda: self.sees(*texts), seconds)
 

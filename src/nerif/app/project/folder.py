@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections import OrderedDict
 from collections.abc import Callable, Collection, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Lock
@@ -37,21 +38,17 @@ class Contents:
     experiments : folders of images that have views
     calibrations : calibration files (.toml)
     measurements : measurement files (.nc)
-    volumes : volume files (.nc, .vti) outside of result directories
     results : result directories, also of current runs
     films : stores over time (.zarr)
     models : surfaces of bodies (.stl, .obj, .ply)
-    unread : paths that could not be read, with the cause
     """
 
     experiments: tuple[str, ...] = ()
     calibrations: tuple[str, ...] = ()
     measurements: tuple[str, ...] = ()
-    volumes: tuple[str, ...] = ()
     results: tuple[str, ...] = ()
     films: tuple[str, ...] = ()
     models: tuple[str, ...] = ()
-    unread: tuple[tuple[str, str], ...] = ()
 
 
 class ProjectFolder:
@@ -128,33 +125,20 @@ class ProjectFolder:
         return entry[1]
 
     def contents(self) -> Contents:
-        """Search the folder."""
-        names: dict[str, list[str]] = {name: [] for name in Contents.__dataclass_fields__ if name != "unread"}
-        unread: list[tuple[str, str]] = []
-        for path in self._walk(self.folder, DEPTH, [0], unread):
-            name = word_of(path.relative_to(self.folder).as_posix())
-            try:
-                if not path.resolve().is_relative_to(self.folder):
-                    continue
-                kind = self._kind(path)
-            except OSError as error:
-                unread.append((name, error.strerror or str(error)))
-                continue
-            except InputError as error:
-                unread.append((name, str(error)))
-                continue
-            if kind:
-                names[kind].append(name)
-        return Contents(**{k: tuple(sorted(v)) for k, v in names.items()}, unread=tuple(unread))
+        """Search the folder; what cannot be read is passed over."""
+        names: dict[str, list[str]] = {name: [] for name in Contents.__dataclass_fields__}
+        for path in self._walk(self.folder, DEPTH, [0]):
+            with suppress(OSError, InputError):
+                if path.resolve().is_relative_to(self.folder) and (kind := self._kind(path)):
+                    names[kind].append(word_of(path.relative_to(self.folder).as_posix()))
+        return Contents(**{kind: tuple(sorted(found)) for kind, found in names.items()})
 
-    def _walk(self, folder: Path, depth: int, count: list[int], unread: list[tuple[str, str]]) -> Iterator[Path]:
+    def _walk(self, folder: Path, depth: int, count: list[int]) -> Iterator[Path]:
         """Yield the folder, its files and its folders; stores and results are not searched further."""
         yield folder
-        try:
+        entries: list[os.DirEntry[str]] = []
+        with suppress(OSError):
             entries = sorted(os.scandir(folder), key=lambda e: e.name)
-        except OSError as error:
-            unread.append((folder.relative_to(self.folder).as_posix(), error.strerror or str(error)))
-            return
         for entry in entries:
             count[0] += 1
             if entry.name.startswith(".") or count[0] > LIMIT:
@@ -167,7 +151,7 @@ class ProjectFolder:
                 yield path
                 yield from (p for p in (path / "measurement.nc",) if p.is_file())
             elif depth:
-                yield from self._walk(path, depth - 1, count, unread)
+                yield from self._walk(path, depth - 1, count)
 
     def _kind(self, path: Path) -> str:
         """Name of the field of Contents that a path belongs to, empty if none."""
@@ -183,9 +167,7 @@ class ProjectFolder:
         if ending(path) == ".toml":
             return "calibrations" if self.from_cache(self.relative(path), "kind", _is_calibration) else ""
         named = ending(path) == ".nc" and path.name != "reprojection.nc"
-        if named and self.from_cache(self.relative(path), "kind", kind_of) is not VOLUME:
-            return "measurements"
-        return "volumes" if ending(path) in (".nc", ".vti") and not _is_result(path.parent) else ""
+        return "measurements" if named and self.from_cache(self.relative(path), "kind", kind_of) is not VOLUME else ""
 
 
 def _is_result(path: Path) -> bool:
