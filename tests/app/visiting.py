@@ -46,7 +46,7 @@ class Visitor:
         end = time.monotonic() + seconds
         while not condition():
             assert time.monotonic() < end, self.text[-2000:]
-            await asyncio.sleep(0.02)
+            await asyncio.sleep(0.1)
 
     def all(self, kind: type[ui.element] = ui.element, **properties: str) -> list[Any]:
         """The visible elements of a kind with these properties, in the order of the page."""
@@ -129,7 +129,7 @@ async def visiting(folder: Path) -> AsyncIterator[Visitor]:
     async with user_simulation(lambda: None) as user:
         for page in PAGES:
             ui.page(page.path, response_timeout=30)(_handler(work, page))
-        app.timer(0.05, work.jobs.advance)
+        app.timer(0.2, work.jobs.advance)
         app.on_exception(errors.append)
         try:
             yield Visitor(user, work)
