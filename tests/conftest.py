@@ -79,6 +79,12 @@ def unchecked() -> Iterator[None]:
     jaxtyping.config.update("jaxtyping_disable", before)
 
 
+@pytest.fixture
+def lines() -> list[str]:
+    """Lines that are reported, by their `append`."""
+    return []
+
+
 @pytest.fixture(scope="session")
 def box() -> Box:
     """A box of three different edges, mm."""

@@ -7,7 +7,27 @@ from pathlib import Path
 
 import numpy as np
 
+from nerif.imaging.readers.frames import Frames
+
 N, H, W = 4, 7, 10
+LUMINANCE = [0.299, 0.587, 0.114]
+
+
+def same(frames: Frames, stack: np.ndarray) -> None:
+    """Check that frames, read backwards and forwards, are those of a stack."""
+    assert len(frames) == len(stack)
+    assert frames.shape == stack.shape[1:]
+    for i in [*range(len(stack))[::-1], *range(len(stack))]:
+        assert frames[i].dtype == stack.dtype
+        np.testing.assert_array_equal(frames[i], stack[i])
+
+
+def dots(seed: int, shape: tuple[int, int]) -> np.ndarray:
+    """Random dots of 3 px, 0 to 1."""
+    from scipy.ndimage import gaussian_filter
+
+    spread = gaussian_filter((np.random.default_rng(seed).random(shape) < 0.06).astype(float), 1.2)
+    return np.clip(spread / np.percentile(spread, 99), 0, 1)
 
 
 def write_tiff(path: Path, image: np.ndarray, **options) -> None:

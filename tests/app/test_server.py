@@ -17,7 +17,6 @@ from urllib.parse import urlsplit
 
 import psutil
 import pytest
-from nerif.cli.commands.settings import read_settings
 
 from app.serving import Served, answering, free_port, outside, served
 from nerif.app.command import App
@@ -27,6 +26,7 @@ from nerif.app.server.guard import cookie_of
 from nerif.app.server.private import page_leading_to
 from nerif.app.server.server import Address, is_relevant
 from nerif.cli.cli import main
+from nerif.cli.settings import read_settings
 from nerif.common.conventions import InputError
 from refusals import refused
 from report.browsing import needs_browser, wait_for

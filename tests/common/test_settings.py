@@ -46,7 +46,7 @@ def test_valid_values():
         ("shape", (1, 2, 3), "2 values"),
         ("names", "ab", "a list of values"),
     ],
-)
+)  # fmt: skip
 def test_invalid_values(field, value, words):
     with refused(field) as error:
         replace(Example(), **{field: value})

@@ -29,16 +29,12 @@ BOX = Box.cube(50.0)
     ("numbers", "units", "expected"),
     [
         ([0, 4, 8], "ms", [0, 0.004, 0.008]),
-        ([0, 4, 8], "milliseconds since 2024-05-03 12:00:00.5", [0, 0.004, 0.008]),
-        ([1.5, 2], "Minutes", [90, 120]),
-        ([0, 1], "hours since 1970-01-01", [0, 3600]),
-        ([250, 500], "\u00b5s", [250e-6, 500e-6]),
-        ([3, 5], "nanoseconds", [3e-9, 5e-9]),
-        ([2, 3], None, [2, 3]),
-        (np.array([0, 4], "m8[ms]"), None, [0, 0.004]),
+        ([0, 4, 8], "milliseconds since 2024-05-03 12:00:00.5", [0, 0.004, 0.008]), ([1.5, 2], "Minutes", [90, 120]),
+        ([0, 1], "hours since 1970-01-01", [0, 3600]), ([250, 500], "\u00b5s", [250e-6, 500e-6]),
+        ([3, 5], "nanoseconds", [3e-9, 5e-9]), ([2, 3], None, [2, 3]), (np.array([0, 4], "m8[ms]"), None, [0, 0.004]),
         (np.array(["1970-01-01T00:00:01", "1970-01-01T00:00:02"], "M8[s]"), None, [1, 2]),
     ],
-)
+)  # fmt: skip
 def test_times_in_any_unit_are_seconds(numbers, units, expected):
     times = seconds(np.asarray(numbers), units, "film")
     assert times.tolist() == pytest.approx(expected, rel=1e-14)

@@ -42,11 +42,6 @@ def write_own(directory: Path, *names: str) -> None:
 
 
 @pytest.fixture
-def lines() -> list[str]:
-    return []
-
-
-@pytest.fixture
 def result(tmp_path, lines) -> ResultDirectory:
     """The directory of a run with trials and figures."""
     result = ResultDirectory(tmp_path / "r", lines.append)

@@ -253,23 +253,6 @@ def test_a_wrong_number_of_squares_and_a_large_error_are_refused():
         calibrate(images("telecentric", NOISE), replace(SETTINGS["telecentric"], max_error=0.01))
 
 
-@pytest.mark.parametrize(
-    ("change", "field"),
-    [
-        ({"axes": ("x+", "y+", "z-")}, "axes"),
-        ({"distortion": ("k9",)}, "distortion"),
-        ({"max_error": 0.0}, "max_error"),
-        ({"projection": "fisheye"}, "projection"),
-        ({"projection": "telecentric", "side": None}, "side"),
-        ({"projection": "telecentric", "side": (NAMES[0], "left")}, "side"),
-        ({"projection": "telecentric", "side": (NAMES[0], "x+"), "scheimpflug": True}, "scheimpflug"),
-    ],
-)
-def test_invalid_settings(change, field, unchecked):
-    with refused(field):
-        CalibrationSettings(**change)
-
-
 def test_names_of_views_and_poses_that_are_none():
     with refused("calibrate"):
         calibrate([], SETTINGS["perspective"])

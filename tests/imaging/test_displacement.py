@@ -207,22 +207,6 @@ def test_shake_ignores_outliers_and_leaves_a_still_image_unchanged():
     assert np.abs(np.median(remove_shake(d, border(SHAPE, 12)) - d, axis=(0, 1))).max() < 0.02
 
 
-@pytest.mark.parametrize(
-    ("field", "value"),
-    [
-        ("method", "piv"),
-        ("smoothness", 0.0),
-        ("max_sigma", -1.0),
-        ("local_contrast", -1),
-        ("shake_border", -3),
-        ("min_correlation", 1.5),
-    ],
-)
-def test_invalid_settings(field, value, unchecked):
-    with refused(field):
-        DisplacementSettings(**{field: value})
-
-
 @pytest.mark.usefixtures("unchecked")
 def test_invalid_images(pattern):
     references, flow = images(pattern, STILL)

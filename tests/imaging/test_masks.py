@@ -73,12 +73,6 @@ def test_the_visible_strip_of_a_hidden_island_remains(noisy):
     assert flow_mask(d, sigma, MaskSettings(grow=0))[26:31, 34:36].all()
 
 
-@pytest.mark.parametrize("name", ["threshold", "smooth", "smallest", "grow"])
-def test_invalid_settings(name):
-    with refused(name):
-        MaskSettings(**{name: -1})
-
-
 @pytest.fixture(scope="module")
 def four() -> Measurement:
     """A ball of hot gas in four views, the smaller image of the last one padded."""
@@ -114,24 +108,22 @@ def test_drawn_masks_take_precedence(four, tmp_path):
             drawn_masks(folder, names)
 
 
-def test_masks_drawn_at_twice_the_size_are_binned_and_reported(four, tmp_path):
+def test_masks_drawn_at_twice_the_size_are_binned_and_reported(four, tmp_path, lines):
     image = np.zeros((128, 128), np.uint8)
     image[20:100, 41:80] = 255
     iio.imwrite(tmp_path / f"{four.names[1]}.png", image)
     drawings = drawn_masks(tmp_path, four.names)
     with refused(tmp_path / f"{four.names[1]}.png"):
         with_flow_masks(four, drawings=drawings)
-    lines: list[str] = []
     mask = with_flow_masks(four, drawings=drawings, say=lines.append).flow_mask[1]
     assert torch.equal(mask, torch.from_numpy(image[::2, ::2] > 0))  # without the column of which half is inside
     assert len(lines) == 1
 
 
 @pytest.mark.parametrize("name", ["cam1.jpg", "cam1.PNG", "Cam1.png", "CAM1.TIFF"])
-def test_drawings_with_any_ending_and_letters(tmp_path, name):
+def test_drawings_with_any_ending_and_letters(tmp_path, name, lines):
     image = np.zeros((40, 40), np.uint8)
     image[8:32, 8:24] = 255
-    lines: list[str] = []
     iio.imwrite(tmp_path / name, image)
     iio.imwrite(tmp_path / "other.png", image)
     masks = drawn_masks(tmp_path, ["cam1", "cam2"], lines.append)
@@ -226,17 +218,3 @@ def test_invalid_drawings_write_nothing(tmp_path, name, shapes, field):
     with refused(field):
         write_masks(tmp_path / "project" / "masks", {"a": [SQUARE], name: shapes}, {"a": (12, 20), name: (12, 20)})
     assert list(tmp_path.rglob("*")) == []
-
-
-@pytest.mark.parametrize(
-    ("arguments", "field"),
-    [
-        (("oval", ((0, 0),)), "kind"),
-        (("polygon", ((0, 0), (1, 1))), "points"),
-        (("brush", ((float("nan"), 0),)), "points"),
-        (("brush", ((0, 0),), True, 0.0), "width"),
-    ],
-)
-def test_invalid_shapes(arguments, field):
-    with refused(field):
-        MaskShape(*arguments)

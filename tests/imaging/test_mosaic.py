@@ -10,12 +10,11 @@ import numpy as np
 import pytest
 import torch
 from scipy.ndimage import gaussian_filter, map_coordinates, zoom
-from scipy.spatial.transform import Rotation
 
+from calibration_images import camera_at_origin, imaged
 from imaging_files import packed, write_cv, write_images, write_photron, write_tiff
 from nerif.data.cameras_file import CalibratedCamera
-from nerif.geometry import Camera, Plane, Ring
-from nerif.imaging.calibration.bundle import Pose
+from nerif.geometry import Ring
 from nerif.imaging.calibration.simple_rig import find_image
 from nerif.imaging.calibration.target_images import find_targets
 from nerif.imaging.calibration.targets import CalibrationTarget
@@ -29,9 +28,6 @@ from nerif.imaging.readers.mosaic import PATTERNS, bayer_pattern
 from nerif.imaging.readers.open import open_frames, read_mask
 from nerif.imaging.readers.views import View, find_views, good_images
 from nerif.imaging.recording import camera_of
-from nerif.simulation.experiment import place
-from nerif.simulation.experiment_settings import Sensor
-from nerif.simulation.rendering import render
 from refusals import refused
 
 H, W = 128, 160
@@ -61,11 +57,6 @@ def exposed(light: np.ndarray, rng: np.random.Generator, bits: int = 12, exposur
 @pytest.fixture
 def rng() -> np.random.Generator:
     return np.random.default_rng(7)
-
-
-@pytest.fixture
-def lines() -> list[str]:
-    return []
 
 
 SCENES = {
@@ -273,24 +264,13 @@ def test_the_camera_of_full_images_fits_the_binned_ones(tmp_path, rng):
 
 
 def test_targets_in_raw_images_are_detected_where_they_are(tmp_path, rng, lines):
-    camera = Camera(
-        intrinsics=torch.tensor([[1500.0, 0, 163], [0, 1490.0, 118], [0, 0, 1]], dtype=torch.float64),
-        rotation=torch.eye(3, dtype=torch.float64),
-        translation=torch.zeros(3, dtype=torch.float64),
-        image_size=(240, 320),
-        background=Plane(torch.tensor([0.0, 0, -1], dtype=torch.float64), -900.0),
-        distortion=torch.zeros(5, dtype=torch.float64),
-    )
-    target = CalibrationTarget("chessboard", 8, 7, pitch=7.0)
-    pose = Pose(Rotation.from_euler("xyz", (15, -10, 5), degrees=True).as_matrix(), np.array([-2.0, 1.5, 360.0]))
-    light = np.asarray(render(camera, place(target, pose, camera)))
-    image = Sensor().expose(torch.from_numpy(light * filters("RGGB", light.shape)), seed=1)
+    target, camera = CalibrationTarget("chessboard", 8, 7, pitch=7.0), camera_at_origin()
+    image, truth = imaged(target, camera, (15, -10, 5), filters=filters("RGGB", (240, 320)))
     (tmp_path / "cam1" / "target").mkdir(parents=True)
     write_tiff(tmp_path / "cam1" / "target" / "pose_0.tif", image)
     images = find_targets(find_views(tmp_path)[0], target, lines.append)
     assert images.size == (120, 160)
     assert "note: cam1/target: raw Bayer mosaic (RGGB or BGGR), binned to 120 x 160 px" in lines[0]
-    truth = camera.project(torch.from_numpy(target.points @ pose.rotation.T + pose.translation)).numpy()
     error = images.poses["0"].pixels - ((truth[images.poses["0"].ids] + 0.5) / 2 - 0.5)
     assert len(error) > 0.8 * len(truth)
     assert np.sqrt(np.mean(error**2)) < 0.05

@@ -50,14 +50,6 @@ def test_wavelet_noise_has_one_band_and_multiscale_noise_many():
     assert shares["multiscale"] > 0.5
 
 
-@pytest.mark.parametrize(("field", "value"), [("kind", "stripes"), ("width", 0.0), ("fill", 0.9), ("dot", 30.0)])
-def test_invalid_patterns(field, value, unchecked):
-    with refused(field):
-        Background(**{"width": 60.0, "height": 40.0, "dot": 1.0, field: value})
-    with refused("pixel"):
-        Background("dots", 60.0, 40.0, 1.0).raster(0.8)
-
-
 def test_files_are_of_true_size(tmp_path):
     pattern = Background("wavelet", 60.0, 40.0, dot=2.0)
     print_pattern(tmp_path / "p.png", pattern, dpi=101.6)

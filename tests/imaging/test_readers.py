@@ -18,7 +18,9 @@ from imageio import v3
 from PIL import EpsImagePlugin, Image
 
 from imaging_files import (
+    LUMINANCE,
     packed,
+    same,
     stamped,
     write_b16,
     write_cv,
@@ -40,7 +42,6 @@ from refusals import refused
 
 N, H, W = 4, 7, 10
 PACKED = Path(__file__).parents[3] / "shared" / "data" / "surface" / "circular_1.tif"
-LUMINANCE = [0.299, 0.587, 0.114]
 
 
 @pytest.fixture
@@ -56,14 +57,6 @@ def stack8(rng) -> np.ndarray:
 @pytest.fixture
 def stack12(rng) -> np.ndarray:
     return rng.integers(3000, 4096, (N, H, W)).astype(np.uint16)
-
-
-def same(frames: Frames, stack: np.ndarray) -> None:
-    assert len(frames) == len(stack)
-    assert frames.shape == stack.shape[1:]
-    for i, expected in enumerate(stack):
-        assert frames[i].dtype == expected.dtype
-        np.testing.assert_array_equal(frames[i], expected)
 
 
 def good_frames(frames: Frames) -> tuple[list[int], dict[str, str]]:
@@ -259,8 +252,7 @@ def test_photron_packed_12_bit(tmp_path, rng, xml, h, w, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("bit", "depth", "side", "shift"),
-    [(8, 8, "Lower", 0), (16, 12, "Lower", 0), (16, 12, "Higher", 4)],
+    ("bit", "depth", "side", "shift"), [(8, 8, "Lower", 0), (16, 12, "Lower", 0), (16, 12, "Higher", 4)]
 )
 def test_photron_whole_bytes(tmp_path, rng, bit, depth, side, shift):
     stack = rng.integers(0, 255, (N, H, W)).astype(np.uint8 if bit == 8 else np.uint16)
@@ -365,11 +357,18 @@ def test_raw_images_of_photo_cameras(tmp_path, rng, codes, cfa):
         open_frames("IMG_2.dng", tmp_path)[0]
 
 
-def test_raw_images_without_their_package(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "rawpy", None)
-    (tmp_path / "a.NEF").touch()
-    with pytest.raises(InputError, match=r"pip install 'nerif-bost\[raw\]', or export"):
-        open_frames(tmp_path / "a.NEF")
+@pytest.mark.parametrize(
+    ("package", "name", "words"),
+    [
+        ("rawpy", "a.NEF", r"\[raw\]', or export"), ("av", "a.avi", r"\[video\]', or export"),
+        *(("lvpyio", name, r"\[lavision\]'.*LaVision's own terms") for name in ("a.im7", "a.vc7")),
+    ],
+)  # fmt: skip
+def test_files_without_the_package_that_reads_them(tmp_path, monkeypatch, package, name, words):
+    monkeypatch.setitem(sys.modules, package, None)
+    (tmp_path / name).touch()
+    with pytest.raises(InputError, match=f"pip install 'nerif-bost{words}"):
+        open_frames(tmp_path / name)
 
 
 # --- LaVision
@@ -422,14 +421,6 @@ def test_invalid_lavision_files(tmp_path, stack12, lavision):
     assert errors[0].startswith("B2.im7 frame 1: expected at least 2 images")
     assert errors[1].startswith("B3.im7 frame 0: cannot be read")
     assert "different frame sizes" in errors[1]
-
-
-@pytest.mark.parametrize("suffix", ["im7", "vc7"])
-def test_lavision_without_its_package(tmp_path, monkeypatch, suffix):
-    monkeypatch.setitem(sys.modules, "lvpyio", None)
-    (tmp_path / f"a.{suffix}").touch()
-    with pytest.raises(InputError, match=r"pip install 'nerif-bost\[lavision\]'.*LaVision's own terms"):
-        open_frames(tmp_path / f"a.{suffix}")
 
 
 # --- arrays
@@ -583,12 +574,6 @@ def test_crop_up_to_the_edge():
 def test_crop_beyond_the_frame(crop):
     with refused("crop"):
         crop(np.zeros((9, 14)))
-
-
-@pytest.mark.parametrize(("field", "value"), [("row", -1), ("width", -2), ("flip", "left"), ("rotate", 45)])
-def test_invalid_crop(field, value):
-    with refused(field):
-        Crop(**{field: value})
 
 
 def test_reference_and_flow_have_one_size_and_depth(tmp_path, stack12, stack8):

@@ -59,11 +59,6 @@ def recording(tmp_path) -> Recording:
     return write_experiment(tmp_path)
 
 
-@pytest.fixture
-def lines() -> list[str]:
-    return []
-
-
 def test_views_that_cannot_be_used_are_left_out(recording, tmp_path, lines):
     path = recording.views[1].folder / recording.views[1].sources["flow"]
     tifffile.imwrite(path, tifffile.imread(path)[:1])

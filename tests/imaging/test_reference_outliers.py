@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 import tifffile
-from scipy.ndimage import gaussian_filter
 from scipy.ndimage import shift as moved
 
+import imaging_files
 from nerif.imaging.quality.image_quality import image_quality
 from nerif.imaging.quality.reference_outliers import outliers, without_outliers
 from nerif.imaging.quality.thumbnails import Thumbnail, match
@@ -19,13 +20,7 @@ SHAPE = (100, 130)
 ROWS, COLUMNS = np.mgrid[: SHAPE[0], : SHAPE[1]]
 
 
-def dots(seed: int) -> np.ndarray:
-    """Random dots of 3 px, 0 to 1."""
-    points = np.random.default_rng(seed).random(SHAPE) < 0.06
-    spread = gaussian_filter(points.astype(float), 1.2)
-    return np.clip(spread / np.percentile(spread, 99), 0, 1)
-
-
+dots = partial(imaging_files.dots, shape=SHAPE)
 PATTERN = dots(0)
 FLOW = moved(PATTERN, (0, 1.5)) * (COLUMNS < 50) + PATTERN * (COLUMNS >= 50)
 HAND = np.where(ROWS < 40, 0.4, PATTERN)
@@ -62,10 +57,9 @@ def check(view: View, lines: list[str]) -> list[str]:
 
 @pytest.mark.parametrize("count", [3, 6])
 @pytest.mark.parametrize("reason", BAD)
-def test_one_bad_reference_is_left_out_by_name_with_the_reason(tmp_path, reason, count):
+def test_one_bad_reference_is_left_out_by_name_with_the_reason(tmp_path, reason, count, lines):
     scenes = [PATTERN] * count
     scenes[1] = BAD[reason]
-    lines: list[str] = []
     assert len(check(write(tmp_path, scenes), lines)) == count - 1
     (line,) = lines
     assert line.startswith("left out: cam1/reference/ref_001.tif: ")
@@ -74,8 +68,7 @@ def test_one_bad_reference_is_left_out_by_name_with_the_reason(tmp_path, reason,
     assert [name for name, why in quality.bad if reason in why] == ["cam1/reference/ref_001.tif"]
 
 
-def test_the_flow_image_decides_between_two_references(tmp_path):
-    lines: list[str] = []
+def test_the_flow_image_decides_between_two_references(tmp_path, lines):
     for bad in (dots(1), moved(PATTERN, (0, 5), mode="reflect")):
         assert check(write(tmp_path, [bad, PATTERN]), lines) == ["ref_001.tif"]
     assert "does not correlate" in lines[0]
@@ -90,8 +83,7 @@ def test_the_quality_of_references_needs_no_flow_images(tmp_path):
     assert note.startswith("view 'cam1': the 2 references do not correlate")
 
 
-def test_references_that_nothing_decides_between_are_named_and_used(tmp_path):
-    lines: list[str] = []
+def test_references_that_nothing_decides_between_are_named_and_used(tmp_path, lines):
     assert len(check(write(tmp_path, [dots(1), dots(2)], PATTERN), lines)) == 2
     assert len(check(write(tmp_path, [moved(PATTERN, (0, 5)), PATTERN], moved(PATTERN, (5, 9))), lines)) == 2
     assert lines[0].startswith("note: view 'cam1': the 2 references do not correlate with one another")
@@ -125,9 +117,8 @@ def test_match_measures_the_shift(size):
     assert match(first, Thumbnail.of(np.kron(dots(1), np.ones((size, size)))[:, 4:]))[0] < 0.3
 
 
-def test_the_flow_image_is_read_only_where_references_contradict_one_another(tmp_path):
+def test_the_flow_image_is_read_only_where_references_contradict_one_another(tmp_path, lines):
     view = write(tmp_path, [PATTERN] * 3)
     view = replace(view, sources={**view.sources, "flow": "cam1/reference"})
-    lines: list[str] = []
     assert len(check(view, lines)) == 3
     assert not lines

@@ -104,14 +104,11 @@ def test_the_dictionary_of_a_board_is_named_also_in_a_mirror(dictionary, mirrore
     ("print_of", "settings", "options"),
     [
         ((9, 7), (7, 9), "--target.columns 9 --target.rows 7"),
-        slow((9, 8), (8, 9), "--target.columns 9 --target.rows 8"),
-        slow((9, 7), (10, 7), "--target.columns 9"),
-        ((9, 7), (9, 6), "--target.rows 7"),
-        ((8, 5), (12, 9), "--target.columns 8 --target.rows 5"),
-        ((9, 8, True), (9, 8), "--target.legacy"),
-        ((9, 8), (9, 8, True), "--target.no-legacy"),
+        slow((9, 8), (8, 9), "--target.columns 9 --target.rows 8"), slow((9, 7), (10, 7), "--target.columns 9"),
+        ((9, 7), (9, 6), "--target.rows 7"), ((8, 5), (12, 9), "--target.columns 8 --target.rows 5"),
+        ((9, 8, True), (9, 8), "--target.legacy"), ((9, 8), (9, 8, True), "--target.no-legacy"),
     ],
-)
+)  # fmt: skip
 def test_layout_of_a_board(print_of, settings, options):
     columns, rows, *legacy = settings
     target = CalibrationTarget("charuco", columns, rows, legacy=bool(legacy))
@@ -214,14 +211,13 @@ def test_exposure_and_contrast_are_measured():
         assert cause in explain([image], BOARD, 255.0)
 
 
-def test_a_view_is_explained_once(tmp_path):
+def test_a_view_is_explained_once(tmp_path, lines):
     for view in ("cam1", "cam2"):
         for source in ("target", "background"):
             (tmp_path / view / source).mkdir(parents=True)
     for i, image in enumerate(photographs(charuco(9, 7, "DICT_5X5_50"), count=4)):
         tifffile.imwrite(tmp_path / "cam1" / "target" / f"{i}.tif", image.astype(np.uint16) << 4)
         tifffile.imwrite(tmp_path / "cam1" / "background" / f"{i}.tif", image.astype(np.uint16)[:, ::-1] << 4)
-    lines: list[str] = []
     right = replace(BOARD, dictionary="DICT_5X5_50")
     views = find_views(tmp_path, ["cam1"])
     with refused("view 'cam1'") as error:

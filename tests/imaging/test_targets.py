@@ -4,16 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import torch
-from scipy.spatial.transform import Rotation
 
-from nerif.geometry import Camera, Plane
-from nerif.imaging.calibration.bundle import Pose
+from calibration_images import camera_at_origin, imaged
+from nerif.geometry import Camera
 from nerif.imaging.calibration.targets import CalibrationTarget
-from nerif.simulation.experiment import place
-from nerif.simulation.experiment_settings import Sensor
-from nerif.simulation.rendering import render
-from refusals import refused
 
 TARGETS = {
     "chessboard": CalibrationTarget("chessboard", 10, 7, pitch=6.0),
@@ -24,23 +18,7 @@ TARGETS = {
 
 @pytest.fixture(scope="module")
 def camera() -> Camera:
-    """A camera at the origin that looks along z, with some distortion."""
-    return Camera(
-        intrinsics=torch.tensor([[1500.0, 0, 163], [0, 1490.0, 118], [0, 0, 1]], dtype=torch.float64),
-        rotation=torch.eye(3, dtype=torch.float64),
-        translation=torch.zeros(3, dtype=torch.float64),
-        image_size=(240, 320),
-        background=Plane(torch.tensor([0.0, 0, -1], dtype=torch.float64), -900.0),
-        distortion=torch.tensor([-0.1, 0.05, 0.001, -0.001, 0], dtype=torch.float64),
-    )
-
-
-def imaged(target: CalibrationTarget, camera: Camera, angles: tuple[float, float, float], bits: int = 12) -> tuple:
-    """An image of the target 360 mm before the camera, and where its points are."""
-    pose = Pose(Rotation.from_euler("xyz", angles, degrees=True).as_matrix(), np.array([-2.0, 1.5, 360.0]))
-    image = Sensor(bits=bits).expose(render(camera, place(target, pose, camera)), seed=1)
-    points = torch.from_numpy(target.points @ pose.rotation.T + pose.translation)
-    return image, camera.project(points).numpy()
+    return camera_at_origin((-0.1, 0.05, 0.001, -0.001, 0))
 
 
 def errors(target: CalibrationTarget, image: np.ndarray, truth: np.ndarray) -> np.ndarray:
@@ -127,20 +105,3 @@ def test_points_are_centred_and_a_pitch_apart(kind):
     assert np.allclose(points.mean(axis=0), 0)
     assert len(points) == np.prod(target.shape)
     assert np.isclose(np.linalg.norm(points[1] - points[0]), target.pitch)
-
-
-@pytest.mark.parametrize(
-    ("values", "field"),
-    [
-        (("checker", 9, 7), "kind"),
-        (("chessboard", 9, 7), "target"),
-        (("chessboard", 3, 2), "target"),
-        (("charuco", 9, 7, 0.0), "target"),
-        (("charuco", 9, 7, 5.0, 6.0), "target"),
-        (("charuco", 9, 7, 5.0, 3.0, "DICT_9X9"), "dictionary"),
-        (("charuco", 12, 10, 5.0, 0.0, "DICT_4X4_50"), "dictionary"),
-    ],
-)
-def test_targets_that_cannot_be(values, field, unchecked):
-    with refused(field):
-        CalibrationTarget(*values).raster(0.5)

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+from functools import partial
 
 import numpy as np
 import pytest
 import tifffile
-from scipy.ndimage import gaussian_filter, map_coordinates
+from scipy.ndimage import map_coordinates
 
+import imaging_files
 from nerif.data.cameras_file import CalibratedCamera
 from nerif.geometry import Box, Ring
 from nerif.imaging.imaging_settings import DisplacementSettings
@@ -22,10 +24,7 @@ NAMES = [camera.name for camera in CAMERAS]
 BOX = Box((-25.0, -25.0, -25.0), (25.0, 25.0, 25.0))
 
 
-def dots(seed: int) -> np.ndarray:
-    points = np.random.default_rng(seed).random(SHAPE) < 0.06
-    spread = gaussian_filter(points.astype(float), 1.2)
-    return np.clip(spread / np.percentile(spread, 99), 0, 1)
+dots = partial(imaging_files.dots, shape=SHAPE)
 
 
 def recording(folder, scenes: dict[str, list[np.ndarray]]) -> Recording:
@@ -58,9 +57,8 @@ OTHERS = {
 
 
 @pytest.mark.parametrize("case", OTHERS)
-def test_a_view_of_unrelated_images_is_left_out_with_the_cause(tmp_path, case):
+def test_a_view_of_unrelated_images_is_left_out_with_the_cause(tmp_path, case, lines):
     scenes, cause = OTHERS[case]
-    lines: list[str] = []
     measurement, _ = measure_instant(recording(tmp_path, scenes), say=lines.append)
     assert A not in measurement.names
     (line,) = (line for line in lines if line.startswith(f"view '{A}' left out"))
@@ -68,9 +66,8 @@ def test_a_view_of_unrelated_images_is_left_out_with_the_cause(tmp_path, case):
     assert cause in line
 
 
-def test_the_bad_one_of_several_averaged_images_is_left_out(tmp_path):
+def test_the_bad_one_of_several_averaged_images_is_left_out(tmp_path, lines):
     recorded = recording(tmp_path, {f"{A}/flow": [dots(0), dots(7)]})
-    lines: list[str] = []
     reference = ViewReference.of(recorded, recorded.views[0])
     both, one = (reference.measure(numbers, lines.append)[1] for numbers in ([0, 1], [0]))
     (line,) = (line for line in lines if line.startswith("left out"))

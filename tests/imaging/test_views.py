@@ -52,11 +52,6 @@ def folder(tmp_path):
     return tmp_path
 
 
-@pytest.fixture
-def lines() -> list[str]:
-    return []
-
-
 def test_folders_are_views_in_natural_order(folder):
     views = find_views(folder)
     assert [v.name for v in views] == ["cam2", "cam10"]
@@ -90,14 +85,10 @@ def test_crops_of_a_shared_sensor(folder, lines):
 @pytest.mark.parametrize(
     "text",
     [
-        "[views.a]\nrefrence = 'x'\n",
-        "[views.a]\nrow = 'x'\n",
-        "[views.a]\nframe_offset = 1.5\n",
-        "views = 3\n",
-        "[views.a\n",
-        "reference = 'x'\n",
+        "[views.a]\nrefrence = 'x'\n", "[views.a]\nrow = 'x'\n", "[views.a]\nframe_offset = 1.5\n", "views = 3\n",
+        "[views.a\n", "reference = 'x'\n",
     ],
-)
+)  # fmt: skip
 def test_invalid_views_file(folder, text):
     (folder / "views.toml").write_text(text)
     with refused(folder if text.startswith("reference") else folder / "views.toml"):
@@ -199,13 +190,10 @@ def test_images_are_shrunk_and_never_enlarged():
 @pytest.mark.parametrize(
     ("files", "expected"),
     [
-        (["pose_007.tif", "pose_012.tif"], ["7", "12"]),
-        (["stack8.tif"], ["0", "1"]),
-        (["a.tif", "b.tif"], ["0", "1"]),
-        (["a1.tif", "b1.tif"], ["0", "1"]),
-        (["pose_-1.tif", "pose_1.tif"], ["-1", "1"]),
+        (["pose_007.tif", "pose_012.tif"], ["7", "12"]), (["stack8.tif"], ["0", "1"]), (["a.tif", "b.tif"], ["0", "1"]),
+        (["a1.tif", "b1.tif"], ["0", "1"]), (["pose_-1.tif", "pose_1.tif"], ["-1", "1"]),
     ],
-)
+)  # fmt: skip
 def test_poses_are_named_by_numbers_in_names(tmp_path, files, expected):
     for file in files:
         tifffile.imwrite(tmp_path / file, np.ones((3 - len(files), *SHAPE), np.uint8), photometric="minisblack")

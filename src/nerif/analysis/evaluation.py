@@ -21,7 +21,7 @@ from nerif.analysis.metrics import coverage, slice_metrics, view_metrics, volume
 from nerif.analysis.prediction import check_sees, reproject
 from nerif.analysis.residuals import white_noise, whiteness
 from nerif.common.arrays import filled
-from nerif.common.conventions import InputError, with_unit
+from nerif.common.conventions import InputError, with_unit, within
 from nerif.data.measurement import Measurement
 from nerif.data.measurement_data import Observation
 from nerif.data.quantity_names import INDEX
@@ -258,10 +258,8 @@ def _truth(path: Path, box: Box, n_ambient: float, quantity: str) -> Volume:
     check_inside(path, truth.grid.box, box)
     if quantity != INDEX:
         return truth
-    try:
+    with within(path):
         return truth.relative_to(n_ambient)
-    except InputError as error:
-        raise error.inside(path) from None
 
 
 def _coverage(directory: ResultDirectory, truth: Volume) -> dict[str, Any]:

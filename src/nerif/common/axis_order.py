@@ -11,11 +11,7 @@ __all__ = ["order_remedy"]
 def order_remedy(name: str, axes: Sequence[str], expected: Sequence[int], actual: Sequence[int]) -> str:
     """Return which axes of an array are swapped and the line of NumPy that undoes it; empty if none are.
 
-    Parameters
-    ----------
-    name : of the array
-    axes : names of its axes
-    expected, actual : its sizes along them
+    Expected and actual are its sizes along the axes.
     """
     if tuple(actual) == tuple(expected) or sorted(actual) != sorted(expected):
         return ""

@@ -7,26 +7,15 @@ from __future__ import annotations
 
 import math
 import unicodedata
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import SupportsFloat
 
 __all__ = [
-    "AMBIENT_INDEX",
-    "COMPONENTS",
-    "DEFAULT_AMBIENT_FACES",
-    "FACES",
-    "LARGEST_INDEX",
-    "LARGEST_LENGTH",
-    "STATISTICS",
-    "InputError",
-    "ambient_index",
-    "check_name",
-    "parse_faces",
-    "percent",
-    "printable",
-    "unit_shown",
-    "whole",
-    "with_unit",
-]
+    "AMBIENT_INDEX", "COMPONENTS", "DEFAULT_AMBIENT_FACES", "FACES", "LARGEST_INDEX", "LARGEST_LENGTH", "STATISTICS",
+    "InputError", "ambient_index", "check_name", "parse_faces", "percent", "printable", "unit_shown", "whole",
+    "with_unit", "within",
+]  # fmt: skip
 
 COMPONENTS = ("u", "v")
 """Displacement components: u along columns, v along rows, both in px."""
@@ -40,12 +29,7 @@ DEFAULT_AMBIENT_FACES = ("x-", "x+", "y-", "y+")
 AMBIENT_INDEX = 1.00027
 """Default refractive index: air at 20 °C and one atmosphere."""
 
-STATISTICS = {
-    "std": "standard deviation",
-    "p05": "5th percentile",
-    "p95": "95th percentile",
-    "certainty": "certainty",
-}
+STATISTICS = {"std": "standard deviation", "p05": "5th percentile", "p95": "95th percentile", "certainty": "certainty"}
 """Suffixes of bootstrap statistics of a quantity (density_std), and their names."""
 
 LARGEST_INDEX = 4.0
@@ -78,6 +62,15 @@ class InputError(ValueError):
         return error
 
 
+@contextmanager
+def within(place: object) -> Iterator[None]:
+    """Prefix an InputError of the block with the file or view in which it occurs."""
+    try:
+        yield
+    except InputError as error:
+        raise error.inside(place) from None
+
+
 def ambient_index(value: object, name: str = "n_ambient") -> float:
     """Return the refractive index around the flow, a number between 0.9 and 4, as a float."""
     if not isinstance(value, SupportsFloat) or not 0.9 < float(value) < LARGEST_INDEX:
@@ -91,12 +84,7 @@ def printable(text: str) -> str:
 
 
 def check_name(name: str, of: str) -> None:
-    """Refuse a name with control characters, which would reach terminals, reports and names of files.
-
-    Parameters
-    ----------
-    of : what has the name, such as "view"
-    """
+    """Refuse the name of a view, say, with control characters: they would reach terminals, reports, names of files."""
     if any(unicodedata.category(c) in CONTROL for c in name):
         raise InputError(f"expected a name without control characters, got {name!a}", field=of)
 

@@ -25,7 +25,8 @@ from nerif.common.conventions import InputError
 
 __all__ = [
     "DISK_FULL", "WINDOWS", "atomic", "check_file", "check_known", "ending", "instead_of_file", "is_file_name",
-    "is_near", "local_path", "read_json", "read_toml", "read_yaml", "recorded", "write_json", "write_toml", "written",
+    "is_near", "local_path", "read_json", "read_toml", "read_yaml", "reading", "recorded", "write_json", "write_toml",
+    "written",
 ]  # fmt: skip
 
 WINDOWS = os.name == "nt"
@@ -177,6 +178,18 @@ def check_file(path: str | os.PathLike[str], expected: str = "file") -> None:
         raise InputError(f"no such {expected}", field=path)
     if not path.is_file():
         raise InputError(f"{instead_of_file(path)}; expected a {expected}", field=path)
+
+
+@contextmanager
+def reading(message: str, field: object = "") -> Iterator[None]:
+    """Raise an InputError with `message` for any error inside; the block holds little but calls of a library."""
+    try:
+        yield
+    except (InputError, MemoryError):
+        raise
+    except Exception as error:  # libraries raise anything on damaged files
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+        raise InputError(f"{message} ({reason})", field=field) from None
 
 
 def read_toml(path: str | os.PathLike[str], expected: str = "TOML file") -> dict[str, Any]:

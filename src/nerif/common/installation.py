@@ -5,10 +5,13 @@ from __future__ import annotations
 import re
 import shlex
 from collections.abc import Sequence
+from importlib import import_module
+from typing import Any
 
+from nerif.common.conventions import InputError
 from nerif.common.files import WINDOWS
 
-__all__ = ["DISTRIBUTION", "command_line", "install", "package_conflict", "quoted", "word_of"]
+__all__ = ["DISTRIBUTION", "command_line", "install", "optional", "package_conflict", "quoted", "word_of"]
 
 DISTRIBUTION = "nerif-bost"
 COMMAND = "nerif.cli.cli:main"
@@ -20,6 +23,15 @@ OPTION = re.compile(r"-(?![\d.])")
 def install(extra: str) -> str:
     """Return the command that installs an extra of pyproject.toml."""
     return f"pip install '{DISTRIBUTION}[{extra}]'"
+
+
+def optional(package: str, extra: str, field: str, remedy: str) -> Any:
+    """Return an optional package; InputError with the command that installs it, and another remedy."""
+    try:
+        return import_module(package)
+    except ImportError:
+        text = f"expected the package {package}, which is not installed; {install(extra)}{remedy}"
+        raise InputError(text, field=field) from None
 
 
 def word_of(name: object) -> str:

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from nerif.common.conventions import InputError
-from nerif.common.files import atomic, instead_of_file
+from nerif.common.conventions import InputError, within
+from nerif.common.files import atomic, instead_of_file, reading
 from nerif.common.hdf5 import open_hdf5
 from nerif.common.memory import check_memory
 
@@ -25,27 +25,19 @@ if TYPE_CHECKING:
 CLASSIC, WIDE = (b"CDF\x01", b"CDF\x02"), b"CDF\x05"
 """First bytes of NetCDF-3 files."""
 
-__all__ = ["opened", "reading", "values", "write_dataset"]
+__all__ = ["opened", "values", "write_dataset"]
 
 
 @contextmanager
 def opened(path: str | os.PathLike[str], expected: str) -> Iterator[xr.Dataset]:
-    """Open a file as a lazy dataset; an InputError inside the block gets the file name as prefix.
-
-    Parameters
-    ----------
-    expected : content of the file, such as "a measurement"
-    """
+    """Open a file, `expected` to be "a measurement", say, as a lazy dataset; InputErrors of the block name the file."""
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{instead_of_file(path)}; expected {expected}", field=path)
     with reading(f"{path}: not a readable NetCDF file, or truncated"):
         dataset = _dataset(path)
-    with dataset:
-        try:
-            yield dataset
-        except InputError as error:
-            raise error.inside(path) from None
+    with dataset, within(path):
+        yield dataset
 
 
 def _dataset(path: Path) -> xr.Dataset:
@@ -86,15 +78,3 @@ def values(variable: xr.DataArray) -> np.ndarray:
     if numbers.dtype.kind not in "fiub":
         raise InputError(f"expected numbers, got {numbers.dtype}", field=field)
     return numbers
-
-
-@contextmanager
-def reading(message: str) -> Iterator[None]:
-    """Raise an InputError with `message` for any error inside; the block holds nothing but calls of a library."""
-    try:
-        yield
-    except (InputError, MemoryError):
-        raise
-    except Exception as error:  # libraries raise anything on damaged files
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputError(f"{message} ({reason})") from None

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from nerif.common.conventions import InputError
-from nerif.common.files import ending, instead_of_file
+from nerif.common.conventions import InputError, within
+from nerif.common.files import ending, instead_of_file, reading
 from nerif.geometry.body import UNITS, Body
 
 __all__ = ["FORMATS", "read_body"]
@@ -30,10 +30,7 @@ def read_body(
     unit : of its lengths, one of UNITS
     say : called with a line if triangles were turned
 
-    Raises
-    ------
-    InputError
-        If the file cannot be read, or the mesh is not closed.
+    Raises InputError if the file cannot be read, or the mesh is not closed.
     """
     path = Path(path)
     if unit not in UNITS:
@@ -43,10 +40,8 @@ def read_body(
     if not path.is_file():
         raise InputError(f"{instead_of_file(path)}; expected the mesh of a body", field=path)
     vertices, faces = _triangles(path)
-    try:
+    with within(path.parent):
         body = Body(torch.from_numpy(vertices * UNITS[unit]), torch.from_numpy(faces), path.stem)
-    except InputError as error:
-        raise error.inside(path.parent) from None
     if not np.array_equal(body.faces.numpy(), faces):
         about = "if a program mirrored the model, it is mirrored here too"
         say(f"{path}: its triangles face inwards and were turned; {about}")
@@ -60,12 +55,9 @@ def _triangles(path: Path) -> tuple[np.ndarray, np.ndarray]:
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import cKDTree
 
-    try:
+    with reading("cannot be read as a mesh; export the model as STL again", path):  # trimesh has no error of its own
         mesh: Any = trimesh.load(path, force="mesh", process=False, skip_materials=True)
         vertices, faces = np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.int64)
-    except Exception as error:  # trimesh has no error of its own
-        reason = f"{type(error).__name__}: {error}"
-        raise InputError(f"cannot be read as a mesh ({reason}); export the model as STL again", field=path) from None
     if not len(faces):
         raise InputError("expected triangles, got none; export surfaces, not points or curves", field=path)
     if not np.isfinite(vertices).all():

@@ -34,7 +34,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerif.common.arrays import Matrix3
-from nerif.common.conventions import InputError, check_name
+from nerif.common.conventions import InputError, check_name, within
 from nerif.common.files import check_known, read_toml, write_toml
 from nerif.geometry import PERSPECTIVE, Box, Camera, Lens, Plane, Projection, projection_named
 from nerif.geometry.distortion import UPRIGHT
@@ -133,28 +133,26 @@ class CalibratedCamera:
 
 def check_camera(camera: CalibratedCamera, source: str) -> CalibratedCamera:
     """Return the camera if it is a valid one, else raise an InputError that names the source."""
-    try:
+    with within(source):
         # without the lens: its focus may depend on a background that is still to come
         whole = replace(camera, lens=None).camera(camera.image_size or (1, 1))
         if camera.image_size is not None:
             whole.check_distortion()
-    except InputError as error:
-        raise error.inside(source) from None
     return camera
 
 
 def numbers(value: Any, shape: tuple[int, ...], name: str) -> Tensor:
     """Return finite numbers of a shape, float64."""
-    expected = f"{' x '.join(map(str, shape))} numbers" if shape else "a number"
+    expected, shown = f"{' x '.join(map(str, shape))} numbers" if shape else "a number", " ".join(repr(value).split())
     try:
         array = torch.as_tensor(value.tolist() if isinstance(value, np.ndarray) else value, dtype=torch.float64)
     except (TypeError, ValueError, RuntimeError):
-        raise InputError(f"expected {expected}, got {value!r}", field=name) from None
+        raise InputError(f"expected {expected}, got {shown}", field=name) from None
     if tuple(array.shape) != shape:
         got = " x ".join(map(str, array.shape)) or "a single number"
         raise InputError(f"expected {expected}, got {got}", field=name)
     if not bool(torch.isfinite(array).all()):
-        raise InputError(f"expected finite numbers, got {value!r}", field=name)
+        raise InputError(f"expected finite numbers, got {shown}", field=name)
     return array
 
 
@@ -163,7 +161,7 @@ def flat(value: Any, name: str, group: int = 1) -> np.ndarray:
     try:
         vector = np.asarray(value, dtype=np.float64).ravel()
     except (TypeError, ValueError):
-        raise InputError(f"expected numbers, got {value!r}", field=name) from None
+        raise InputError(f"expected numbers, got {' '.join(repr(value).split())}", field=name) from None
     if vector.size % group:
         raise InputError(f"expected a multiple of {group} numbers, got {vector.size}", field=name)
     return vector
@@ -180,7 +178,7 @@ def _plane(normal: Any, offset: Any, name: str) -> Plane:
     direction = numbers(normal, (3,), f"{name}: normal")
     length = float(direction.norm())
     if not length > 0:
-        raise InputError(f"expected a direction, got {normal}", field=f"{name}: normal")
+        raise InputError(f"expected a direction, got {direction.tolist()}", field=f"{name}: normal")
     return Plane(direction / length, float(numbers(offset, (), f"{name}: offset")) / length)
 
 
@@ -188,7 +186,7 @@ def _coefficients(coefficients: Any, name: str) -> tuple[Tensor, Tensor]:
     """The first five of OpenCV's coefficients, and the last two of all 14."""
     vector = flat([] if coefficients is None else coefficients, name)
     if not np.isfinite(vector).all():
-        raise InputError(f"expected finite numbers as distortion coefficients, got {coefficients!r}", field=name)
+        raise InputError(f"expected finite numbers as distortion coefficients, got {vector.tolist()}", field=name)
     whole = np.concatenate([vector, np.zeros(max(0, 14 - len(vector)))])
     if whole[5:12].any() or whole[14:].any():
         raise InputError(
@@ -287,10 +285,8 @@ def read_box(path: str | os.PathLike[str]) -> Box | None:
         return None
     corners = numbers(table["box"], (2, 3), f"{path}: box (lower and upper corner, mm)")
     lower, upper = ((float(x), float(y), float(z)) for x, y, z in corners)
-    try:
+    with within(path):
         return Box(lower, upper)
-    except InputError as error:
-        raise error.inside(path) from None
 
 
 def read_cameras(path: str | os.PathLike[str]) -> tuple[CalibratedCamera, ...]:
@@ -328,7 +324,5 @@ def _lens(table: dict[str, Any], where: str) -> Lens | None:
         if focus is not None:
             raise InputError("focus_distance: expected together with aperture_diameter, got it alone", field=where)
         return None
-    try:
+    with within(where):
         return Lens(diameter, focus)
-    except InputError as error:
-        raise error.inside(where) from None

@@ -92,8 +92,7 @@ CONVERT = (
 )
 FILM_FILE = Kind("a film as one NetCDF file", f"make it a store: {CONVERT % 'open_dataset'}")
 FORMAT_2 = Kind(
-    "a store of Zarr format 2",
-    f"if you trust it (its filters can run code), convert it: {CONVERT % 'open_zarr'}",
+    "a store of Zarr format 2", f"if you trust it (its filters can run code), convert it: {CONVERT % 'open_zarr'}"
 )
 ZIPPED = Kind("a zipped store", "unpack it: python -m zipfile -e {path} .")
 ZIPPED_CONTENT = Kind("a zipped store", "unpack it: python -m zipfile -e {path} NAME.zarr")

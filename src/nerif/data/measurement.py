@@ -60,13 +60,9 @@ class Measurement(MeasurementData):
 
 
 def measurement_of(
-    values: Mapping[type[ForwardModel], Float[Tensor, "view row column c"]],
-    cameras: Sequence[Camera],
-    box: Box,
-    n_ambient: float,
-    wavelength_nm: float | None = None,
-    ambient_faces: tuple[str, ...] = DEFAULT_AMBIENT_FACES,
-) -> Measurement:
+    values: Mapping[type[ForwardModel], Float[Tensor, "view row column c"]], cameras: Sequence[Camera], box: Box,
+    n_ambient: float, wavelength_nm: float | None = None, ambient_faces: tuple[str, ...] = DEFAULT_AMBIENT_FACES,
+) -> Measurement:  # fmt: skip
     """Return a measurement of values by technique; with sigma 1 where there are several techniques."""
     maps = {kind.measured: value for kind, value in values.items()}
     if len(values) > 1:

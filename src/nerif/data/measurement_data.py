@@ -6,7 +6,7 @@ import difflib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Self, TypeVar
+from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Bool, Float
@@ -14,7 +14,7 @@ from torch import Tensor
 
 from nerif.common.arrays import make_tensors
 from nerif.common.axis_order import order_remedy
-from nerif.common.conventions import DEFAULT_AMBIENT_FACES, InputError, ambient_index, parse_faces, unit_shown
+from nerif.common.conventions import DEFAULT_AMBIENT_FACES, InputError, ambient_index, parse_faces, unit_shown, within
 from nerif.forward.forward_model import ForwardModel
 from nerif.forward.registry import TECHNIQUES, forward_model
 from nerif.geometry import Box, Camera, Rays
@@ -277,10 +277,8 @@ class MeasurementData:
         for o in self.observations:
             forward_model(o.technique, self)  # raises where the technique needs more
             for i, (name, usable) in enumerate(zip(self.names, self.usable_for(o), strict=True)):
-                try:
+                with within(f"view '{name}'"):
                     o.technique.check(o.values[i], None if o.sigma is None else o.sigma[i], usable)
-                except InputError as error:
-                    raise error.inside(f"view '{name}'") from None
 
     def _check_geometry(self) -> None:
         """Check that backgrounds are behind the box and that rays cross it."""
@@ -345,7 +343,7 @@ class MeasurementData:
         views, rows, columns, *_ = next(iter(self.all_maps.values())).shape
         return views, rows, columns
 
-    def observed(self, values: Mapping[str, Tensor], sigmas: Mapping[str, Tensor | None] | None = None) -> Self:
+    def observed(self: Data, values: Mapping[str, Tensor], sigmas: Mapping[str, Tensor | None] | None = None) -> Data:
         """Return the measurement with other values (view, row, column, c) and sigmas, by technique name.
 
         A technique that is not named keeps its values; where sigmas are given, it loses its sigma.
@@ -422,12 +420,7 @@ class MeasurementData:
     def rays(
         self, observation: Observation | None = None
     ) -> tuple[Rays, Float[Tensor, "n c"], Float[Tensor, "n c"] | None]:
-        """Return the usable rays that cross the box, their values by one technique, and sigma or None.
-
-        Parameters
-        ----------
-        observation : the first of the measurement by default
-        """
+        """Return the usable rays that cross the box, their values by one technique (default: the first), and sigma."""
         observation = observation or self.observations[0]
         mask = self.usable_for(observation)
         traced = self._traced(mask, observation.technique)
@@ -456,11 +449,11 @@ class MeasurementData:
                 block[row, column] = keep
                 yield rays, keep
 
-    def __getitem__(self, names: str | Sequence[str]) -> Self:
+    def __getitem__(self: Data, names: str | Sequence[str]) -> Data:
         """Return the measurement of a view, or of some."""
         return self.select(names)
 
-    def select(self, names: str | Sequence[str]) -> Self:
+    def select(self: Data, names: str | Sequence[str]) -> Data:
         """Return the measurement of a view, or of some in their order here."""
         names = self._views(names, "view")
         index = [i for i, name in enumerate(self.names) if name in names]
@@ -499,11 +492,11 @@ class MeasurementData:
             return cameras
         return tuple(c if c.background is None else c.without_background for c in cameras)
 
-    def drop(self, *names: str) -> Self:
+    def drop(self: Data, *names: str) -> Data:
         """Return the measurement without some views."""
         return self.without(names)
 
-    def without(self, withheld: str | Sequence[str]) -> Self:
+    def without(self: Data, withheld: str | Sequence[str]) -> Data:
         """Return the measurement of the other views."""
         withheld = self._views(withheld, "withhold")
         training = [name for name in self.names if name not in withheld]

@@ -13,9 +13,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nerif.common.conventions import COMPONENTS, DEFAULT_AMBIENT_FACES, InputError, parse_faces, whole
+from nerif.common.conventions import COMPONENTS, DEFAULT_AMBIENT_FACES, InputError, parse_faces, whole, within
+from nerif.common.files import reading
 from nerif.common.memory import check_memory
-from nerif.common.netcdf import reading, values
+from nerif.common.netcdf import values
 from nerif.data.kinds import BOST, known_conventions
 from nerif.data.measurement_data import MASKS, MeasurementData
 from nerif.forward.deflection import Deflection
@@ -424,10 +425,8 @@ def _lenses(dataset: xr.Dataset, names: list[str]) -> list[Lens | None]:
     columns.append(_optional(dataset, "focus_distance", views).tolist())
     lenses: list[Lens] = []
     for name, diameter, window, focus in zip(names, *columns, strict=True):
-        try:
+        with within(f"view '{name}'"):
             lenses.append(Lens(diameter, None if math.isnan(focus) else focus, window=window))
-        except InputError as error:
-            raise error.inside(f"view '{name}'") from None
     return [*lenses] if any(lens.wide for lens in lenses) else [None] * len(names)
 
 

@@ -13,11 +13,10 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from nerif.common.conventions import InputError
-from nerif.common.files import atomic, read_json
-from nerif.common.installation import install
+from nerif.common.conventions import InputError, within
+from nerif.common.files import atomic, read_json, reading
+from nerif.common.installation import optional
 from nerif.common.memory import check_memory
-from nerif.common.netcdf import reading
 from nerif.common.times import check_interval, interval, seconds
 from nerif.data.kinds import SEQUENCE, known_conventions, reading_as
 from nerif.data.measurement import Measurement
@@ -30,7 +29,7 @@ if TYPE_CHECKING:
     import zarr
     from torch import Tensor
 
-__all__ = ["ZARR_FORMAT", "MeasurementSequence", "add_frames", "check_instants", "check_store", "require_zarr"]
+__all__ = ["ZARR_FORMAT", "MeasurementSequence", "add_frames", "check_instants", "check_store", "require_store"]
 
 ZARR_FORMAT: Final = 3
 """Format of every store. Format 2 has filters that unpickle what they read: a foreign store could run code."""
@@ -41,21 +40,18 @@ BYTES_OF_TIME = 64  # of an instant in a tuple
 MAX_FRAMES_SEARCHED = 20  # for one with all views
 
 
-def require_zarr() -> None:
-    """Raise an InputError if zarr is not installed."""
-    try:
-        import zarr  # noqa: F401
-    except ImportError:
-        raise InputError(f"zarr is not installed; {install('sequence')}", field="sequences") from None
+def require_store(path: Path, expected: str) -> None:
+    """Raise an InputError if zarr is not installed, or a path is no Zarr store."""
+    optional("zarr", "sequence", "sequences", "")
+    if not (path / "zarr.json").is_file():
+        what = "no zarr.json in it" if path.is_dir() else "no such store"
+        raise InputError(f"{what}; expected {expected}", field=path)
 
 
 def check_store(path: Path, kind: tuple[str, str]) -> None:
     """Check that a path to replace is free or a store of the same kind without foreign files.
 
-    Parameters
-    ----------
-    path : to replace, if present
-    kind : content of the store, and the name of an attribute or array that marks it
+    `kind` is the content of the store, and the name of an attribute or array that marks it.
     """
     if not os.path.lexists(path):
         return
@@ -75,15 +71,9 @@ def check_store(path: Path, kind: tuple[str, str]) -> None:
 
 
 def add_frames(
-    group: zarr.Group,
-    name: str,
-    frames: int,
-    sizes: tuple[int, ...],
-    dimensions: tuple[str, ...],
-    kind: str | np.dtype,
-    fill: float | str = float("nan"),
-    **attributes: Any,
-) -> None:
+    group: zarr.Group, name: str, frames: int, sizes: tuple[int, ...], dimensions: tuple[str, ...],
+    kind: str | np.dtype, fill: float | str = float("nan"), **attributes: Any,
+) -> None:  # fmt: skip
     """Add an array with a leading dimension time and one chunk per frame."""
     group.create_array(
         name, shape=(frames, *sizes), chunks=(1, *sizes), dtype=kind, fill_value=fill,
@@ -152,15 +142,13 @@ class MeasurementSequence:
             one = dataset.isel(time=index) if "time" in dataset.dims else dataset
             check_memory(one.nbytes, self.path, place)
             one = one.load()
-        try:
+        with within(place):
             dimensions = variables()
             maps = [one[name] for name in _technique_maps(one) if one[name].dims == dimensions[name][0]]
             if maps:
                 with_data = np.any([m.notnull().all(m.dims[3:]).any(("row", "column")).values for m in maps], axis=0)
                 one = one.isel(view=with_data) if with_data.any() else one
             return Measurement.from_dataset(one.drop_vars(["time", WRITTEN], errors="ignore"))
-        except InputError as error:
-            raise error.inside(place) from None
 
     def body_arrays(self) -> dict[str, xr.DataArray]:
         """Return the meshes of the bodies in the flow and their poses, by the names in the file."""
@@ -235,9 +223,7 @@ class MeasurementSequence:
     ) -> None:
         """Write one frame, `written` last; views that the measurement lacks have no data then.
 
-        Parameters
-        ----------
-        poses : rotation and translation (mm) of each moving body
+        Poses are rotation and translation (mm) of each moving body.
         """
         import numpy as np
         import zarr
@@ -283,7 +269,7 @@ def _technique_maps(dataset: xr.Dataset) -> tuple[str, ...]:
 
 def _check_arrays(path: Path) -> None:
     """Open the arrays one by one: of several opened at once, zarr prints the errors of all but the first."""
-    require_zarr()
+    require_store(path, f"a measurement sequence (Zarr, {CONVENTIONS})")
     import zarr
 
     for metadata in sorted(path.glob("*/zarr.json")):
@@ -297,10 +283,7 @@ def _opened(path: Path) -> xr.Dataset:
     """Return the store as a dataset that reads on demand."""
     import xarray as xr
 
-    require_zarr()
-    if not (path / "zarr.json").is_file():
-        what = "no zarr.json in it" if path.is_dir() else "no such store"
-        raise InputError(f"{what}; expected a measurement sequence (Zarr, {CONVENTIONS})", field=path)
+    require_store(path, f"a measurement sequence (Zarr, {CONVENTIONS})")
     with reading(f"{path}: not a readable Zarr store"):
         return xr.open_dataset(
             path, engine="zarr", chunks=None, consolidated=False, decode_times=False, zarr_format=ZARR_FORMAT

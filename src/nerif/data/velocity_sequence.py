@@ -39,11 +39,8 @@ class VelocitySequence(VolumeSequence):
     ) -> VelocitySequence:
         """Make a store without values, in place of an earlier one.
 
-        Parameters
-        ----------
-        times : s
-        quantities : beside the components u, v, w: pressure, residuals
-        attributes : physics, properties of the fluid and others, JSON
+        Times are in s; beside the components u, v, w are quantities such as pressure; attributes hold physics and
+        properties of the fluid, JSON.
         """
         about = {"title": "Velocity over time", "kind": VELOCITY_KIND, "n_ambient": 1.0, **attributes}
         store = cls.create(path, times, grid, (*COMPONENTS, *quantities), about["n_ambient"], about)
@@ -94,12 +91,9 @@ def export_frame(
     path: str | os.PathLike[str], store: str | os.PathLike[str], frame: int | None, quantities: Sequence[str] = (),
     force: bool = False,
 ) -> int:  # fmt: skip
-    """Write quantities of one frame of volumes over time, and return their number; .vti holds velocity as vectors.
+    """Write quantities (default: all) of one frame of volumes over time, and return their number.
 
-    Parameters
-    ----------
-    frame : from 0
-    quantities : all by default
+    A .vti holds velocity as vectors.
     """
     volumes = open_volumes(store)
     wanted = quantities or volumes.quantities

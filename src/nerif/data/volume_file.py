@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nerif.common.conventions import LARGEST_INDEX, LARGEST_LENGTH, InputError
+from nerif.common.conventions import LARGEST_INDEX, LARGEST_LENGTH, InputError, within
 from nerif.common.files import ending, instead_of_file
 from nerif.common.netcdf import opened, values
 from nerif.data.kinds import VOLUME, reading_as
@@ -39,9 +39,7 @@ def read_volume(path: str | os.PathLike[str], quantity: str | None = None, gaps:
         only = next(iter(arrays)) if len(arrays) == 1 else field_of(q for q in arrays if q in QUANTITIES)
         quantity = next((q for q in ("index_excess", "n") if q in arrays), only)
     if quantity is None or quantity not in arrays:
-        raise InputError(
-            f"expected a variable '{quantity or 'index_excess'}', got {', '.join(arrays)}", field=path
-        )
+        raise InputError(f"expected a variable '{quantity or 'index_excess'}', got {', '.join(arrays)}", field=path)
     volume = _volume(quantity, arrays[quantity], grid, attributes)
     index = quantity in ("index_excess", "n")
     allowed = gaps or (not index and "masked_voxels" in volume.notes)
@@ -52,10 +50,8 @@ def read_volume(path: str | os.PathLike[str], quantity: str | None = None, gaps:
         raise InputError(
             f"variable '{quantity}': expected refractive indices, got values beyond {LARGEST_INDEX}", field=path
         )
-    try:
+    with within(path):
         n_ambient = volume.n_ambient
-    except InputError as error:
-        raise error.inside(path) from None
     if quantity == "n" and n_ambient is not None:
         return Volume((volume.values - n_ambient).float(), grid, "index_excess", "1", volume.attributes)
     return volume

@@ -9,12 +9,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from nerif.common.conventions import InputError, ambient_index
-from nerif.common.files import atomic
+from nerif.common.files import atomic, reading
 from nerif.common.memory import check_memory
-from nerif.common.netcdf import reading
 from nerif.common.times import check_interval, interval, seconds
 from nerif.data.kinds import SEQUENCE_RESULT, TRUE_SEQUENCE, Kind, check_kind, reading_as
-from nerif.data.measurement_sequence import ZARR_FORMAT, add_frames, check_instants, check_store, require_zarr
+from nerif.data.measurement_sequence import ZARR_FORMAT, add_frames, check_instants, check_store, require_store
 from nerif.data.quantity_names import describe, field_of, name_of
 from nerif.data.volume import REFERENCES, Volume
 from nerif.forward.forward_model import ForwardModel
@@ -27,10 +26,9 @@ if TYPE_CHECKING:
 
 __all__ = ["FIELDS", "StoredViewScores", "VolumeSequence", "score_names"]
 
-Store = TypeVar("Store", bound="VolumeSequence")
-
 FIELDS = ("fields over time", "box_lower_mm")
 """Content of such a store, and an attribute that marks it."""
+Store = TypeVar("Store", bound="VolumeSequence")
 
 
 @dataclass(frozen=True)
@@ -70,23 +68,18 @@ class VolumeSequence:
         check_kind(path, *self.kinds)
 
     def _open(self) -> None:
-        require_zarr()
+        path = self.path
+        require_store(path, "volumes over time (Zarr)")
         import zarr
 
-        path = self.path
-        if not (path / "zarr.json").is_file():
-            what = "no zarr.json in it" if path.is_dir() else "no such store"
-            raise InputError(f"{what}; expected volumes over time (Zarr)", field=path)
-        with reading(f"{path}: expected volumes over time, written by nerif"):
+        expected = "expected volumes over time, written by nerif"
+        with reading(expected, path):
             self.group: zarr.Group = zarr.open_group(self.path, mode="r+", zarr_format=ZARR_FORMAT)
             self.attributes: dict[str, Any] = dict(self.group.attrs)
         if absent := {"box_lower_mm", "box_upper_mm", "n_ambient"} - set(self.attributes):
-            raise InputError(
-                f"expected volumes over time, written by nerif, got a store without {min(absent)}; "
-                "run nerif sequence on measurements",
-                field=path,
-            )
-        with reading(f"{path}: expected volumes over time, written by nerif"):
+            text = f"{expected}, got a store without {min(absent)}; run nerif sequence on measurements"
+            raise InputError(text, field=path)
+        with reading(expected, path):
             z, y, x = (self.array(a).shape[0] for a in "zyx")
             time = self.read("time", slice(None)), self.array("time").attrs.get("units")
             box = Box(tuple(self.attributes["box_lower_mm"]), tuple(self.attributes["box_upper_mm"]))
@@ -98,14 +91,9 @@ class VolumeSequence:
 
     @classmethod
     def create(
-        cls: type[Store],
-        path: Path,
-        times: Sequence[float],
-        grid: Grid,
-        quantities: Sequence[str],
-        n_ambient: float,
+        cls: type[Store], path: Path, times: Sequence[float], grid: Grid, quantities: Sequence[str], n_ambient: float,
         attributes: Mapping[str, Any] | None = None,
-    ) -> Store:
+    ) -> Store:  # fmt: skip
         """Make an empty store in place of an earlier one.
 
         Parameters

@@ -12,8 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nerif.common.conventions import InputError
-from nerif.common.files import atomic
+from nerif.common.conventions import InputError, within
+from nerif.common.files import atomic, reading
 from nerif.common.memory import check_memory
 from nerif.geometry import Box, Grid
 
@@ -129,12 +129,8 @@ def read_vti(path: str | os.PathLike[str]) -> tuple[dict[str, Tensor], Grid, dic
     Source: VTK XML file formats, docs.vtk.org (ImageData; ascii, base64 and raw data, plain or compressed by zlib).
     """
     content = Path(path).read_bytes()
-    try:
+    with reading("not a VTK image file (.vti), or truncated", path), within(path):
         return _Image(content, Path(path)).read()
-    except InputError as error:
-        raise error.inside(path) from None
-    except (ElementTree.ParseError, ArithmeticError, LookupError, ValueError, TypeError, zlib.error) as error:
-        raise InputError(f"not a VTK image file (.vti), or truncated ({error})", field=path) from None
 
 
 TYPES = {"Float32": "f4", "Float64": "f8", "String": "u1"}

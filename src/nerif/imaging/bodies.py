@@ -11,7 +11,8 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from nerif.common.conventions import InputError
+from nerif.common.conventions import InputError, within
+from nerif.common.files import reading
 from nerif.data.measurement import Measurement
 from nerif.data.measurement_sequence import MeasurementSequence
 from nerif.geometry.body import Body, check_place, hidden_pixels, orientations
@@ -40,11 +41,8 @@ def with_bodies(
     unit_stated : whether the unit of the models was stated, so that a small one is meant
     on_view : called with the numbers of views done and of all
 
-    Raises
-    ------
-    InputError
-        If a body is not in the box, its size is not meant, it hides no pixel, or the pixels without data show it
-        mirrored or with other axes.
+    Raises InputError if a body is not in the box, its size is not meant, it hides no pixel, or the pixels without data
+    show it mirrored or with other axes.
     """
     for body in bodies:
         check_size(measurement, body, unit_stated or body in measurement.bodies)
@@ -57,12 +55,7 @@ def with_bodies(
 
 
 def check_size(measurement: Measurement, body: Body, unit_stated: bool = False) -> None:
-    """Raise an InputError for a body that is not in the box, or whose unit of length is likely another.
-
-    Parameters
-    ----------
-    unit_stated : whether the user stated the unit of its lengths, so that a small body is meant
-    """
+    """Raise an InputError for a body that is not in the box, or is small since its unit, if not stated, is another."""
     check_place(body, measurement.box, unit_stated)
     step = _step(measurement)
     largest = max(float(hidden_pixels(c, [body], step=step).double().mean()) for c in measurement.cameras)
@@ -109,16 +102,9 @@ def read_poses(path: Path, bodies: int, frames: int) -> list[list[Pose]]:
     Its columns are rx, ry, rz (axis of the rotation times its angle, degrees) and tx, ty, tz (mm), one row for
     each frame; with several bodies one row for each body of each frame in turn.
     """
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            rows = [[float(row[name]) for name in POSE_COLUMNS] for row in csv.DictReader(file)]
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(
-            f"expected a table with the columns {', '.join(POSE_COLUMNS)} and numbers in them, got an error at {error}",
-            field=path,
-        ) from None
-    except OSError as error:
-        raise InputError(f"cannot be read ({error})", field=path) from None
+    expected = f"expected a table with the columns {', '.join(POSE_COLUMNS)} and numbers in them"
+    with reading(expected, path), path.open(encoding="utf-8-sig", newline="") as file:
+        rows = [[float(row[name]) for name in POSE_COLUMNS] for row in csv.DictReader(file)]
     if len(rows) != bodies * frames:
         raise InputError(f"expected {bodies * frames} rows for {frames} frames, got {len(rows)}", field=path)
     table = torch.tensor(rows, dtype=torch.float64).reshape(frames, bodies, 6)
@@ -160,13 +146,11 @@ def film_with_bodies(
         except InputError:
             continue  # a frame that is missing stays so
         here = [b.moved(*pose) for b, pose in zip(bodies, poses[index], strict=True)] if poses is not None else last
-        try:
+        with within(f"{film.path}, frame {index}"):
             if refine:
                 here = [refine_pose(frame, body, margin=margin).body for body in here]
             checked = with_bodies(frame, here, margin, unit_stated) if first else None
             frame = checked or _hide(frame, here, _hidden(frame, here, margin))
-        except InputError as error:
-            raise error.inside(f"{film.path}, frame {index}") from None
         last, first = here, False
         whole.write_frame(index, frame, [_pose(a, b) for a, b in zip(bodies, here, strict=True)] if moving else None)
         on_frame(index + 1, len(film))

@@ -81,11 +81,7 @@ def write_masks(
     """Write VIEW.png of each view with a drawing, white inside the flow, and return the paths.
 
     Nothing is written if a mask is empty or covers its whole view, or the name of a view cannot be a file name.
-
-    Parameters
-    ----------
-    drawings : by the name of the view
-    shapes : height and width of the views, px
+    Drawings and shapes (height and width, px) are by the names of the views.
     """
     from PIL import Image
 
@@ -110,16 +106,12 @@ STANDARD = MaskSettings()
 
 
 def flow_mask(
-    values: Shaped[np.ndarray, "row column c"],
-    sigma: Shaped[np.ndarray, "row column c"],
+    values: Shaped[np.ndarray, "row column c"], sigma: Shaped[np.ndarray, "row column c"],
     settings: MaskSettings = STANDARD,
-) -> PixelMask:
+) -> PixelMask:  # fmt: skip
     """Return where |values| / sigma exceeds the threshold, without small islands and holes; and where it is unknown.
 
-    Parameters
-    ----------
-    values : NaN where unknown
-    sigma : in the unit of the values; NaN or not positive where unknown
+    Unknown are NaN, and a sigma that is not positive.
     """
     from scipy.ndimage import binary_dilation, gaussian_filter
     from skimage.morphology import remove_small_holes, remove_small_objects
@@ -146,12 +138,8 @@ def drawn_masks(
 ) -> dict[str, Path]:  # fmt: skip
     """Return the images of masks in a folder, VIEW.png and similar, by the names of their views.
 
-    Any ending of an image counts, and small and capital letters are the same where only one view fits.
-
-    Parameters
-    ----------
-    say : called with a line about files that fit no view, and about views without a drawing
-    otherwise : what happens to these views
+    Any ending of an image counts, and small and capital letters are the same where only one view fits. Files that fit
+    no view are reported, and views without a drawing, with what happens to them otherwise.
     """
     if not folder.is_dir():
         raise InputError("no such folder; expected one with VIEW.png for each view", field=folder)
@@ -175,13 +163,10 @@ def drawn_masks(
 
 
 def with_flow_masks(
-    measurement: Measurement,
-    settings: MaskSettings = STANDARD,
-    sigma: float | None = None,
-    drawings: Mapping[str, Path] | None = None,
-    on_view: Callable[[int], None] = lambda count: None,
+    measurement: Measurement, settings: MaskSettings = STANDARD, sigma: float | None = None,
+    drawings: Mapping[str, Path] | None = None, on_view: Callable[[int], None] = lambda count: None,
     say: Callable[[str], None] | None = None,
-) -> Measurement:
+) -> Measurement:  # fmt: skip
     """Return a measurement with a flow mask for each view: the drawn one, else by threshold of any technique.
 
     Parameters

@@ -5,9 +5,9 @@ The reference images of a view are evaluated once (ViewReference); the flow imag
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -30,9 +30,10 @@ from nerif.imaging.readers.views import View, good_images, paired
 from nerif.imaging.shake import row_movement
 from nerif.imaging.workers import cores, work
 
-__all__ = ["Recording", "Scene", "ViewReference", "camera_of", "join_views", "measure_instant"]
+__all__ = ["Recording", "Scene", "ViewReference", "camera_of", "join_views", "measure_instant", "reported"]
 
 PixelMask = Bool[np.ndarray, "row column"]
+Result = TypeVar("Result")
 
 AMBIGUOUS = 0.4, 0.005  # part of a period, and share of the pixels displaced by more
 ROWS = 0.1  # px, movement of rows that is reported
@@ -65,12 +66,8 @@ class Scene:
 def join_views(views: Iterable[ViewMeasurement], scene: Scene, images: bool = False) -> Measurement:
     """Return one measurement of all views; smaller images are padded.
 
-    With images a pixel is valid where either the displacement or the image is; the other is NaN there.
-
-    Parameters
-    ----------
-    views : may be a generator, which keeps one view in memory at a time
-    images : whether to include the image pairs
+    With images a pixel is valid where either the displacement or the image is; the other is NaN there. A generator
+    keeps one view in memory at a time.
     """
     cameras: list[Camera] = []
     maps: dict[str, list[np.ndarray]] = {}
@@ -101,16 +98,14 @@ def join_views(views: Iterable[ViewMeasurement], scene: Scene, images: bool = Fa
 
     return Measurement(
         cameras=tuple(cameras),
-        displacement=stack("displacement"),
         box=scene.box,
-        n_ambient=scene.surroundings.n_ambient,
+        displacement=stack("displacement"),
         sigma=stack("sigma"),
         valid=stack("valid"),
         maps={name: stack(name) for name in ("reference", "flow", "image_sigma") if name in maps},
         flow_mask=stack("flow_mask") if any_mask else None,
-        wavelength_nm=scene.surroundings.wavelength_nm,
-        ambient_faces=scene.surroundings.ambient_faces,
         frame_offsets=frame_offsets,
+        **vars(scene.surroundings),
     )
 
 
@@ -187,12 +182,9 @@ class ViewReference:
     def of(
         cls, recording: Recording, view: View, averages: int = 1, say: Callable[[str], None] = silent
     ) -> ViewReference:
-        """Evaluate the reference images of a view.
+        """Evaluate the reference images of a view, for an average over a number of flow images.
 
-        Parameters
-        ----------
-        averages : number of flow images whose displacements will be averaged
-        say : called with a line about each unusable image, and about a background that repeats
+        Unusable images are reported, and a background that repeats.
         """
         view.check_alike()
         images = without_outliers(view, good_images(view, "reference", say, recording.references), say)
@@ -208,9 +200,8 @@ class ViewReference:
             if repeats.lines is not None:  # the error along them is unknown: noise looks like structure
                 raise InputError(text, field=f"view '{view.name}'")
             say(f"note: view '{view.name}': {text}")
-        return cls(
-            view, camera, reference, recording.masks, region, drawn_mask, recording.images, recording.views, repeats
-        )  # fmt: skip
+        others = recording.views
+        return cls(view, camera, reference, recording.masks, region, drawn_mask, recording.images, others, repeats)
 
     def measure(self, numbers: Sequence[int], say: Callable[[str], None] = silent) -> ViewMeasurement:
         """Return camera, mean displacement over the flow images of these instants, and flow mask."""
@@ -246,7 +237,7 @@ class ViewReference:
 
     def _check_share(
         self, result: DisplacementMap, images: Mapping[str, np.ndarray], say: Callable[[str], None]
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Refuse flow images of another scene, and those without valid pixels; report few valid pixels."""
         share = 1 - sum(result.losses.values())
         if share >= FEW:
@@ -339,18 +330,14 @@ def camera_of(view: View, calibrated: CalibratedCamera, shape: tuple[int, int]) 
 
 
 def measure_instant(
-    recording: Recording,
-    numbers: Sequence[int] = (0,),
-    say: Callable[[str], None] = silent,
-    on_view: Callable[[int], None] = lambda count: None,
-    processes: int | None = None,
-) -> tuple[Measurement, dict[str, str]]:
+    recording: Recording, numbers: Sequence[int] = (0,), say: Callable[[str], None] = silent,
+    on_view: Callable[[int], None] = lambda count: None, processes: int | None = None,
+) -> tuple[Measurement, dict[str, str]]:  # fmt: skip
     """Return the measurement of one instant, and the source of the noise by the name of the view.
 
     Parameters
     ----------
     numbers : of the instants, whose displacements are averaged
-    say : called with a line about each view and image that is left out
     on_view : called with the number of views evaluated
     processes : 1 for this one only; by default one per core if the images are large
     """
@@ -362,9 +349,7 @@ def measure_instant(
     tasks = [(view, tuple(numbers)) for view in views]
     if processes is None:
         processes = recording.processes(len(views), len(views))
-    for count, (i, (result, lines)) in enumerate(work(_measure_view, recording, tasks, processes), 1):
-        for line in lines:
-            say(line)
+    for count, (i, result) in enumerate(reported(_measure_view, recording, tasks, processes, say), 1):
         if isinstance(result, InputError):
             errors.append(str(result))
             say(f"view '{views[i].name}' left out: {result}")
@@ -380,13 +365,30 @@ def measure_instant(
 
 
 def _measure_view(
-    recording: Recording, task: tuple[View, Sequence[int]]
-) -> tuple[ViewMeasurement | InputError, list[str]]:
-    """Measurement of one view at one instant, or the error; and the lines to report."""
+    recording: Recording, task: tuple[View, Sequence[int]], say: Callable[[str], None]
+) -> ViewMeasurement:  # fmt: skip
     view, numbers = task
+    view.check_instants(numbers, "frame, average")
+    return ViewReference.of(recording, view, len(numbers), say).measure(numbers, say)
+
+
+def reported(
+    function: Callable[..., Result], recording: Recording, tasks: Sequence[Any], processes: int,
+    say: Callable[[str], None],
+) -> Iterator[tuple[int, Result | InputError]]:  # fmt: skip
+    """Yield number and result of function(recording, task, say=...), or its InputError, of each task as they finish."""
+    for i, (result, lines) in work(_result_and_lines, (function, recording), tasks, processes):
+        for line in lines:
+            say(line)
+        yield i, result
+
+
+def _result_and_lines(
+    common: tuple[Callable[..., Result], Recording], task: object
+) -> tuple[Result | InputError, list[str]]:  # fmt: skip
+    function, recording = common
     lines: list[str] = []
     try:
-        view.check_instants(numbers, "frame, average")
-        return ViewReference.of(recording, view, len(numbers), lines.append).measure(numbers, lines.append), lines
+        return function(recording, task, say=lines.append), lines
     except InputError as error:
         return error, lines

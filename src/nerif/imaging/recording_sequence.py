@@ -17,7 +17,7 @@ from nerif.data.measurement_file import from_dataset
 from nerif.data.measurement_sequence import MeasurementSequence
 from nerif.geometry import Camera, Lens
 from nerif.imaging.readers.views import OFFSET, View, words_of_range
-from nerif.imaging.recording import Recording, Scene, ViewReference, join_views, silent
+from nerif.imaging.recording import Recording, Scene, ViewReference, join_views, reported, silent
 from nerif.imaging.workers import work
 
 __all__ = ["frame_numbers", "instants_of", "measure_frame", "measure_recording", "references_of"]
@@ -26,32 +26,20 @@ ROUNDING = 1e-9  # relative to the largest of the numbers compared
 
 
 def references_of(
-    recording: Recording,
-    say: Callable[[str], None] = silent,
-    on_view: Callable[[int], None] = lambda count: None,
+    recording: Recording, say: Callable[[str], None] = silent, on_view: Callable[[int], None] = lambda count: None,
     processes: int | None = None,
-) -> tuple[ViewReference, ...]:
+) -> tuple[ViewReference, ...]:  # fmt: skip
     """Evaluate the reference images of all views."""
     views, recording = recording.views, replace(recording, images=False)  # a sequence has no images
     if processes is None:
         processes = recording.processes(len(views), len(views))
     references: dict[int, ViewReference] = {}
-    for i, (reference, lines) in work(_reference, recording, views, processes):
-        for line in lines:
-            say(line)
+    for i, reference in reported(ViewReference.of, recording, views, processes, say):
         if isinstance(reference, InputError):
             raise reference
         references[i] = reference
         on_view(len(references))
     return tuple(references[i] for i in sorted(references))
-
-
-def _reference(recording: Recording, view: View) -> tuple[ViewReference | InputError, list[str]]:
-    lines: list[str] = []
-    try:
-        return ViewReference.of(recording, view, 1, lines.append), lines
-    except InputError as error:
-        return error, lines
 
 
 def measure_frame(
@@ -108,16 +96,10 @@ def instants_of(numbers: Sequence[int], view: View, frame_rate: float) -> tuple[
 
 
 def measure_recording(
-    recording: Recording,
-    numbers: Sequence[int],
-    times: Sequence[float],
-    out: Path,
-    settings: dict[str, Any] | None = None,
-    force: bool = False,
-    say: Callable[[str], None] = silent,
-    on_step: Callable[[int], None] = lambda count: None,
-    processes: int | None = None,
-) -> MeasurementSequence:
+    recording: Recording, numbers: Sequence[int], times: Sequence[float], out: Path,
+    settings: dict[str, Any] | None = None, force: bool = False, say: Callable[[str], None] = silent,
+    on_step: Callable[[int], None] = lambda count: None, processes: int | None = None,
+) -> MeasurementSequence:  # fmt: skip
     """Measure the frames that a store does not have yet, and report what could not be measured.
 
     Parameters
@@ -126,8 +108,6 @@ def measure_recording(
     times : of these, s
     out : Zarr store, created if it does not exist
     settings : written to the store; a store with other settings, frame offsets or cameras is not continued
-    force : replace the store
-    say : called with a line about everything that is left out
     on_step : called with the number of views with evaluated references plus that of finished frames
     processes : 1 for this one only; by default one per core if the images are large
     """

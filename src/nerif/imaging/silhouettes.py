@@ -34,7 +34,7 @@ from nerif.geometry.body import Body
 from nerif.geometry.pose import rotation_matrix
 from nerif.imaging.masks import read_mask
 
-__all__ = ["BodyPose", "drawn_silhouettes", "hull_of_silhouettes", "outline", "refine_pose", "silhouettes_of"]
+__all__ = ["BodyPose", "drawn_silhouettes", "hull_of_silhouettes", "outline", "refine_pose"]
 
 PRIOR = (0.05, 0.05)  # rad; of the longest edge of the box
 UNKNOWN = 0.4  # of the standard deviation of the prior, above which the outlines say nothing of a direction
@@ -90,11 +90,6 @@ class BodyPose:
         )
 
 
-def silhouettes_of(measurement: Measurement) -> Bool[Tensor, "view row column"]:
-    """Return the pixels without data, which show bodies where nothing else was masked."""
-    return ~measurement.usable
-
-
 def drawn_silhouettes(drawings: Mapping[str, Path], measurement: Measurement) -> Bool[Tensor, "view row column"]:
     """Return the silhouettes of images by the names of views (white: body); a view without one has none."""
     masks = torch.zeros(measurement.shape, dtype=torch.bool)
@@ -124,14 +119,11 @@ def refine_pose(
     silhouettes : default: the pixels without data
     margin : pixels by which the silhouettes are larger than the body
 
-    Raises
-    ------
-    InputError
-        If there are no silhouettes, or too few points of an outline are near the body.
+    Raises InputError if there are no silhouettes, or too few points of an outline are near the body.
     """
-    masks = silhouettes_of(measurement) if silhouettes is None else silhouettes
+    where = "pixels without data" if silhouettes is None else "silhouettes"
+    masks = ~measurement.usable if silhouettes is None else silhouettes  # pixels without data show bodies
     if not bool(masks.any()):
-        where = "pixels without data" if silhouettes is None else "silhouettes"
         raise InputError(f"--refine needs {where} where the body is, got none", field=body.name)
     rays, pixel = _outlines(measurement, masks)
     prior = torch.tensor([PRIOR[0]] * 3 + [PRIOR[1] * max(measurement.box.edges)] * 3, dtype=torch.float64)
@@ -144,8 +136,8 @@ def refine_pose(
         near = residual.abs() < gate
         if int(near.sum()) < FEWEST:
             raise InputError(
-                f"--refine needs {'pixels without data' if silhouettes is None else 'silhouettes'} where the body is, "
-                f"got {int(near.sum())} points of their outline within {gate:g} px of its own; check its place",
+                f"--refine needs {where} where the body is, got {int(near.sum())} points of their outline within "
+                f"{gate:g} px of its own; check its place",
                 field=body.name,
             )
         arm = points - centre - pose[3:]
@@ -226,13 +218,7 @@ def _least_distance(body: Body, rays: Rays) -> tuple[Values, Points, Points]:
 def hull_of_silhouettes(
     measurement: Measurement, silhouettes: Bool[Tensor, "view row column"], voxels: int = HULL_VOXELS
 ) -> Body:
-    """Return the largest body that hides nothing outside its silhouettes: their visual hull within the box.
-
-    Raises
-    ------
-    InputError
-        If the silhouettes have no point of the box in common.
-    """
+    """Return the largest body that hides nothing outside its silhouettes: their visual hull within the box."""
     from skimage.measure import marching_cubes
 
     grid = Grid.of_resolution(measurement.box, voxels)

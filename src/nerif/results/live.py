@@ -20,8 +20,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from nerif.common.files import atomic, read_json, write_json
-from nerif.common.netcdf import reading
+from nerif.common.files import atomic, read_json, reading, write_json
 from nerif.common.npz import open_npz
 from nerif.common.written_files import WARN, OwnFiles
 from nerif.data.measurement import Measurement

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal, NotRequired
 from pydantic import BeforeValidator, ConfigDict, TypeAdapter, ValidationError, with_config
 from typing_extensions import TypedDict
 
-from nerif.common.conventions import InputError
+from nerif.common.conventions import InputError, within
 from nerif.common.files import read_json, write_json
 from nerif.reconstruction.rig_parameters import RefinedView
 
@@ -255,10 +255,8 @@ class Metrics:
     def read(cls, path: Path) -> Metrics:
         """Read a file."""
         entries = read_json(path)
-        try:
+        with within(path):
             return cls.of(entries)
-        except InputError as error:
-            raise error.inside(path) from None
 
     def write(self, path: Path) -> None:
         """Write a file, without empty sections, atomically."""

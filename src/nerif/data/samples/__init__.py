@@ -40,17 +40,11 @@ def sample(name: str, folder: str | os.PathLike[str]) -> Path:
     """Copy a real measurement into a folder, with its licence, and return the folder.
 
     Images lie in camera/reference and camera/flow, as nerif displacement expects them; a measurement is
-    measurement.nc.
+    measurement.nc. The folder is new or exists; a file there of the same name that nerif did not write is renamed.
 
     Parameters
     ----------
     name : one of SAMPLES
-    folder : new or existing; a file there of the same name that nerif did not write is renamed
-
-    Raises
-    ------
-    InputError
-        for another name
     """
     if name not in SAMPLES:
         raise InputError(f"expected one of {', '.join(SAMPLES)}, got '{name}'", field="name")

@@ -1,4 +1,4 @@
-"""CameraBundle adjustment: intrinsics, camera poses and target poses from all detected points.
+"""Bundle adjustment: intrinsics, camera poses and target poses from all detected points.
 
     minimise  sum rho(|pixel - project_i(R_i (R_j X + t_j) + t_i)|^2),      rho Huber's loss
 
@@ -11,7 +11,7 @@ Each step of the Levenberg-Marquardt method solves the normal equations exactly,
 converge too. Parameters that no image constrains, such as the depth of a telecentric camera, stay at their initial
 value, with standard deviation 0.
 
-Source: Triggs et al., CameraBundle adjustment - a modern synthesis, 2000.
+Source: Triggs et al., Bundle adjustment - a modern synthesis, 2000.
 """
 
 from __future__ import annotations
@@ -184,11 +184,8 @@ def adjust(
     """Return the adjusted bundle, and the covariance of each camera's parameters.
 
     The covariances (11 intrinsics, rotation about the camera's own axes in rad, translation in mm) follow from the
-    curvature of the sum and the residuals; they include detection noise, not a target that is not flat.
-
-    Parameters
-    ----------
-    noise : standard deviation of a point's coordinates, px, which scales the priors and Huber's loss
+    curvature of the sum and the residuals; they include detection noise, not a target that is not flat. `noise`, the
+    standard deviation of a point's coordinates in px, scales the priors and Huber's loss.
     """
     from scipy.linalg import cho_factor, cho_solve
 

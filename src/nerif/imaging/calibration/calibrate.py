@@ -40,7 +40,7 @@ def calibrate_views(
     say: Callable[[str], None] = lambda text: None,
     on_image: Callable[[], None] = lambda: None,
     leave_out: Sequence[str] = (),
-) -> Calibration:
+) -> Calibration:  # fmt: skip
     """Detect a target in the images of all views, and calibrate their cameras.
 
     Parameters
@@ -70,7 +70,7 @@ def calibrate(
     views: Sequence[TargetDetections],
     settings: CalibrationSettings = STANDARD,
     background_distance: float | None = None,
-) -> Calibration:
+) -> Calibration:  # fmt: skip
     """Calibrate all cameras from the detections in their images.
 
     Refused are cameras with too few poses or none in common with the others, initial poses that contradict one another

@@ -42,9 +42,7 @@ class DotGrid:
 def find_dots(image: np.ndarray, count: int) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, " n"]]:
     """Return centres and diameters of the dark dots in an image of 8 bit, px; none where most are square.
 
-    Parameters
-    ----------
-    count : number of dots expected, which limits their area
+    `count`, the number of dots expected, limits their area.
     """
     import cv2
 

@@ -22,21 +22,13 @@ SAMPLE = 3  # images to explain it
 
 
 def find_targets(
-    view: View,
-    target: CalibrationTarget,
-    say: Callable[[str], None],
-    on_image: Callable[[], None] = lambda: None,
+    view: View, target: CalibrationTarget, say: Callable[[str], None], on_image: Callable[[], None] = lambda: None,
     on_background: CalibrationTarget | None = None,
-) -> TargetDetections:
+) -> TargetDetections:  # fmt: skip
     """Detect the target in all images of a view; report how these are read, and those without a detection.
 
-    Where few images have one, it is said why. InputError if none of those in free space has.
-
-    Parameters
-    ----------
-    say : receives a note on each image that is not used
-    on_image : called after each image
-    on_background : the target on the background, if it differs (a larger print)
+    Where few images have one, it is said why. InputError if none of those in free space has. `on_background` is the
+    target on the background, if it differs (a larger print); `on_image` is called after each image.
     """
     detections: dict[str, dict[str, Detection]] = {"target": {}, "background": {}}
     size, diagnosis = (0, 0), ""

@@ -14,15 +14,9 @@ from nerif.common.settings import check_settings
 from nerif.imaging.calibration.dot_grid import dot_grid, find_dots
 
 __all__ = [
-    "KINDS",
-    "CalibrationTarget",
-    "Detection",
-    "TargetDetections",
-    "eight_bit",
-    "marker_parameters",
-    "marker_squares",
+    "KINDS", "CalibrationTarget", "Detection", "TargetDetections", "eight_bit", "marker_parameters", "marker_squares",
     "saddle_points",
-]
+]  # fmt: skip
 
 KINDS = ("chessboard", "charuco", "circles")
 DICTIONARY = "DICT_4X4_250"
@@ -174,12 +168,7 @@ class CalibrationTarget:
         return self.pitch / max(8, round(self.pitch / pixel))
 
     def detect(self, image: np.ndarray, negative: bool = False) -> Detection | None:
-        """Return the target in an image (8 to 16 bit or float), black on white or white on black, or None.
-
-        Parameters
-        ----------
-        negative : look first for white on black
-        """
+        """Return the target in an image (8 to 16 bit or float), black on white or (first, if `negative`) inverse."""
         image = eight_bit(image)
         if self.kind == "chessboard":
             return self._chessboard(image)

@@ -81,13 +81,9 @@ def _detail(image: np.ndarray, binning: int) -> np.ndarray:
 
 
 def correlate(
-    first: np.ndarray,
-    second: np.ndarray,
-    window: int,
-    passes: int = 4,
-    central: bool = False,
+    first: np.ndarray, second: np.ndarray, window: int, passes: int = 4, central: bool = False,
     start: np.ndarray | None = None,
-) -> Vectors:
+) -> Vectors:  # fmt: skip
     """Return the movement from the first array to the second at the centres of windows.
 
     Parameters

@@ -140,12 +140,9 @@ class Reference:
     def measure(
         self, flow: Sequence[np.ndarray], region: PixelMask | None = None, keep_images: bool = True
     ) -> DisplacementMap:
-        """Return displacement, noise and validity, averaged over flow frames.
+        """Return displacement, noise and validity, averaged over flow frames, and the image pair of a single one.
 
-        Parameters
-        ----------
-        region : where the background is visible, or None
-        keep_images : whether to return the image pair of a single flow frame
+        `region` is where the background is visible.
         """
         settings, reach = self.settings, self.settings.reach
         overexposed = self.overexposed.copy()
@@ -206,12 +203,9 @@ class Reference:
 
 
 def measure(
-    reference: Sequence[np.ndarray],
-    flow: Sequence[np.ndarray],
-    settings: DisplacementSettings,
-    full_scale: float = np.inf,
-    region: PixelMask | None = None,
-) -> DisplacementMap:
+    reference: Sequence[np.ndarray], flow: Sequence[np.ndarray], settings: DisplacementSettings,
+    full_scale: float = np.inf, region: PixelMask | None = None,
+) -> DisplacementMap:  # fmt: skip
     """Return displacement, noise and validity of a view.
 
     Parameters

@@ -107,15 +107,9 @@ class ImagePair:
 
     @classmethod
     def of(
-        cls,
-        reference: Grey,
-        flow: Grey,
-        d: Float[np.ndarray, "row column 2"],
-        noise: CameraNoise | None,
-        repeats: int,
-        usable: PixelMask,
-        valid: PixelMask,
-    ) -> ImagePair:
+        cls, reference: Grey, flow: Grey, d: Float[np.ndarray, "row column 2"], noise: CameraNoise | None, repeats: int,
+        usable: PixelMask, valid: PixelMask,
+    ) -> ImagePair:  # fmt: skip
         """Return the pair with its noise.
 
         Parameters

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Complex, Float, Shaped
 
+from nerif.common.blocks import blocks
 from nerif.common.conventions import InputError
 from nerif.imaging.noise import local_correlation
 from nerif.imaging.readers.frames import as_float
@@ -83,19 +85,15 @@ class Thumbnail:
 
 def thumbnails(view: View, source: str, most: int, shape: tuple[int, ...]) -> Iterator[Thumbnail]:
     """Yield the thumbnails of up to `most` images of a source, those that can be read and have this shape."""
-    try:
+    with suppress(InputError):  # no such images, reported elsewhere
         for _, _, image in read_sample(view, source, most):
             if not isinstance(image, InputError) and image.shape == shape:
                 yield Thumbnail.of(image)
-    except InputError:  # no such images, reported elsewhere
-        return
 
 
 def binned(image: Shaped[np.ndarray, "row column"], binning: int) -> Float[np.ndarray, "rows columns"]:
     """Return the mean over squares of `binning` px; incomplete ones at the edges are dropped."""
-    rows, columns = (n // binning for n in image.shape)
-    part = as_float(image[: rows * binning, : columns * binning])
-    return part.reshape(rows, binning, columns, binning).mean(axis=(1, 3))
+    return as_float(blocks(image, binning, binning)).mean(axis=(1, 3))
 
 
 def match(first: Thumbnail, second: Thumbnail) -> tuple[float, Float[np.ndarray, " 2"]]:

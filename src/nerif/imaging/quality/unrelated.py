@@ -19,10 +19,7 @@ FRAMES = 4  # other flow images that are compared
 def unrelated(reference: Grey, flow: Grey, view: View, views: Sequence[View]) -> str:
     """Return which images are the likely cause if a flow image shows another scene than the reference, else "".
 
-    Parameters
-    ----------
-    view : of both images
-    views : all of the recording, whose images may have been exchanged
+    Images may have been exchanged with those of the other views of the recording.
     """
     still, moving = Thumbnail.of(reference), Thumbnail.of(flow)
     if related(still, moving):

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from nerif.common.conventions import InputError
-from nerif.common.files import ending
+from nerif.common.files import ending, reading
 from nerif.common.hdf5 import open_hdf5
 from nerif.common.memory import check_memory
 from nerif.common.npz import open_npz
 from nerif.common.times import seconds
-from nerif.imaging.readers.frames import Frames, check_count, check_size
+from nerif.imaging.readers.frames import FilmFrames, check_count, check_size
 
 if TYPE_CHECKING:
     import h5py
@@ -24,11 +24,11 @@ __all__ = ["ArrayFrames", "Hdf5Frames"]
 MATLAB = "MATLAB_class"  # attribute of the datasets of its .mat files of version 7.3
 
 
-class ArrayFrames(Frames):
+class ArrayFrames(FilmFrames):
     """A NumPy array of an .npy file (memory-mapped) or an .npz file (read whole: it has no partial access)."""
 
     def __init__(self, path: Path, name: str, dataset: str) -> None:
-        try:
+        with reading("cannot be read, truncated or damaged? Copy it again", name):
             if ending(path) == ".npy":
                 array = np.load(path, mmap_mode="r", allow_pickle=False)
                 _choose({"array": array.shape}, dataset, name)
@@ -37,20 +37,13 @@ class ArrayFrames(Frames):
                     key = _choose(shapes, dataset, name)
                     check_size(shapes[key][-2:], path, name=name)
                     array = archive[key]
-        except InputError:
-            raise
-        except Exception as error:
-            raise InputError(f"cannot be read, truncated or damaged? ({error}); copy it again", field=name) from None
         self._array = array if array.ndim == 3 else array[None]
-        self._name = name
-        if not len(self._array):
+        self._name, self._length = name, len(self._array)
+        if not len(self):
             raise InputError("expected at least one frame, got none", field=name)
 
-    def __len__(self) -> int:
-        return len(self._array)
-
     def name(self, i: int) -> str:
-        return f"{self._name} frame {i}" if len(self) > 1 else self._name
+        return super().name(i) if len(self) > 1 else self._name
 
     def load(self, i: int) -> np.ndarray:
         return np.array(self._array[i])
@@ -74,7 +67,7 @@ def _choose(shapes: dict[str, tuple[int, ...]], dataset: str, name: str) -> str:
     return dataset
 
 
-class Hdf5Frames(Frames):
+class Hdf5Frames(FilmFrames):
     """A dataset (frame, row, column) or (row, column) of an HDF5 file.
 
     Times (s) are in its attribute `times` or in a dataset `times` beside it, effective bits in the attribute `bits`.
@@ -86,35 +79,27 @@ class Hdf5Frames(Frames):
         import h5py
 
         self._path, self._name = path, name
-        try:
-            with open_hdf5(path) as file:
-                shapes: dict[str, tuple[int, ...]] = {}
-                file.visititems(lambda key, x: shapes.update({key: x.shape}) if isinstance(x, h5py.Dataset) else None)
-                self._key = _choose(shapes, dataset.strip("/"), name)
-                data = file[self._key]
-                self._stack, self._length = data.ndim == 3, len(data) if data.ndim == 3 else 1
-                check_size(data.shape[-2:], path, data.dtype.itemsize, name)
-                check_count(self._length, self._length * _part_stored(data), name)
-                bits = data.attrs.get("bits")
-                times = data.attrs.get("times", data.parent.get("times"))
-                if times is not None:
-                    check_memory(times.size * times.dtype.itemsize, path, f"{name}: times")
-                    unit = getattr(times, "attrs", {}).get("units")
-                    times = seconds(np.array(times).ravel(), unit, name)
-                self._transposed = MATLAB in data.attrs
-        except InputError:
-            raise
-        except Exception as error:
-            raise InputError(f"cannot be read as HDF5, truncated or damaged? ({error})", field=name) from None
+        with reading("cannot be read as HDF5, truncated or damaged?", name), open_hdf5(path) as file:
+            shapes: dict[str, tuple[int, ...]] = {}
+            file.visititems(lambda key, x: shapes.update({key: x.shape}) if isinstance(x, h5py.Dataset) else None)
+            self._key = _choose(shapes, dataset.strip("/"), name)
+            data = file[self._key]
+            self._stack, self._length = data.ndim == 3, len(data) if data.ndim == 3 else 1
+            check_size(data.shape[-2:], path, data.dtype.itemsize, name)
+            check_count(self._length, self._length * _part_stored(data), name)
+            bits = data.attrs.get("bits")
+            times = data.attrs.get("times", data.parent.get("times"))
+            if times is not None:
+                check_memory(times.size * times.dtype.itemsize, path, f"{name}: times")
+                unit = getattr(times, "attrs", {}).get("units")
+                times = seconds(np.array(times).ravel(), unit, name)
+            self._transposed = MATLAB in data.attrs
         self.metadata_bits = None if bits is None else int(bits)
         if not self._length:
             raise InputError("expected at least one frame, got none", field=f"{name}:{self._key}")
         if times is not None and times.shape != (self._length,):
             raise InputError(f"expected {self._length} times, one for each frame, got shape {times.shape}", field=name)
         self.times = times
-
-    def __len__(self) -> int:
-        return self._length
 
     def name(self, i: int) -> str:
         return f"{self._name}:{self._key}" + (f" frame {i}" if self._stack else "")

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from nerif.common.conventions import InputError
 from nerif.common.image_names import RAW
-from nerif.common.installation import install
+from nerif.common.installation import optional
 from nerif.imaging.readers.image_file import ImageFile
 
 __all__ = ["CameraRaw"]
@@ -18,9 +17,6 @@ __all__ = ["CameraRaw"]
 
 class CameraRaw(ImageFile):
     """The visible part of the sensor, as the sensor lies: raw values less the black level."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
 
     @staticmethod
     def check_package() -> None:
@@ -64,12 +60,4 @@ class CameraRaw(ImageFile):
 
 
 def _rawpy() -> Any:
-    """Return the package rawpy; InputError if it is not installed."""
-    try:
-        import rawpy
-    except ImportError:
-        raise InputError(
-            f"expected the package rawpy, which is not installed; {install('raw')}, or export the images as TIFF",
-            field=f"raw images ({' '.join(RAW)})",
-        ) from None
-    return rawpy
+    return optional("rawpy", "raw", f"raw images ({' '.join(RAW)})", ", or export the images as TIFF")

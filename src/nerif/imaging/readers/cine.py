@@ -15,7 +15,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from nerif.common.conventions import InputError
-from nerif.imaging.readers.frames import Frames, check_size
+from nerif.imaging.readers.frames import FilmFrames, check_size
 from nerif.imaging.readers.packed import unpack
 
 __all__ = ["CineFrames"]
@@ -56,7 +56,7 @@ TWELVE_BIT[:1015] = np.cumsum([2, *map(int, STEPS)])
 """The 12-bit value of each 10-bit code: the table of the format, BT.709's curve from black (64) to white (4064)."""
 
 
-class CineFrames(Frames):
+class CineFrames(FilmFrames):
     """A Phantom film, or the range of its frames that was saved."""
 
     def __init__(self, path: Path, name: str) -> None:
@@ -84,6 +84,7 @@ class CineFrames(Frames):
                 field=name,
             )
         check_size((abs(height), width), path, name=name)
+        self._length = len(self._positions)
         self._shape, self._is_bottom_up = (abs(height), width), height > 0 and not packing
         self._packed, (self._dtype, self._channels) = PACKED.get(packing, 0), PIXELS[16 if packing else depth]
         bits = 12 if packing else settings["RealBPP"]
@@ -111,12 +112,6 @@ class CineFrames(Frames):
             self.times = np.arange(len(self)) / rate
             if block:
                 self.notes += (f"{self._name}: time stamps out of order; times by its {rate} frames per second",)
-
-    def __len__(self) -> int:
-        return len(self._positions)
-
-    def name(self, i: int) -> str:
-        return f"{self._name} frame {i}"
 
     def load(self, i: int) -> np.ndarray:
         data, (height, width) = self._pixels(i), self._shape

@@ -16,12 +16,14 @@ from typing import SupportsIndex
 import numpy as np
 
 from nerif.common.conventions import InputError
+from nerif.common.files import reading
 from nerif.common.memory import check_memory
 from nerif.common.times import whole_steps
 from nerif.imaging.readers.mosaic import bayer_pattern, phase_means
 
 __all__ = [
-    "FrameLayout", "Frames", "SelectedFrames", "as_float", "check_count", "check_size", "read_each", "size_in_words",
+    "FilmFrames", "FrameLayout", "Frames", "SelectedFrames", "as_float", "check_count", "check_size", "read_each",
+    "size_in_words",
 ]  # fmt: skip
 
 LUMINANCE = np.array([0.299, 0.587, 0.114])  # of R, G, B (ITU-R BT.601)
@@ -103,14 +105,8 @@ class Frames(ABC):
 
     def _full_size(self, i: int) -> np.ndarray:
         """Frame `i` at its full size."""
-        try:
+        with reading("cannot be read, truncated or damaged? Copy or export it again", self.name(i)):
             image = self.load(i)
-        except (InputError, MemoryError):
-            raise
-        except Exception as error:
-            reason = (str(error).strip() or type(error).__name__).splitlines()[0]
-            text = f"cannot be read, truncated or damaged? ({reason}); copy or export it again"
-            raise InputError(text, field=self.name(i)) from None
         return _grey_frame(image, self.name(i))
 
     @cached_property
@@ -174,6 +170,19 @@ class Frames(ABC):
                 field=self.name(i),
             )
         return self._binned(image)
+
+
+class FilmFrames(Frames):
+    """The frames of one file."""
+
+    _name: str
+    _length: int
+
+    def __len__(self) -> int:
+        return self._length
+
+    def name(self, i: int) -> str:
+        return f"{self._name} frame {i}"
 
 
 class SelectedFrames(Frames):

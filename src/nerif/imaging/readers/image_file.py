@@ -24,8 +24,8 @@ class ImageFile(ABC):
     notes: tuple[str, ...] = ()
     """Warnings about the file."""
 
-    @abstractmethod
-    def __init__(self, path: Path) -> None: ...
+    def __init__(self, path: Path) -> None:
+        self._path = path
 
     @staticmethod  # noqa: B027 (most need none)
     def check_package() -> None:

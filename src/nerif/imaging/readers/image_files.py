@@ -9,17 +9,17 @@ import struct
 import weakref
 import zlib
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 import numpy as np
 
-from nerif.common.conventions import InputError
+from nerif.common.conventions import InputError, within
 from nerif.common.files import ending
 from nerif.common.image_names import NETPBM, PILLOW, RAW
-from nerif.common.installation import install
+from nerif.common.installation import optional
 from nerif.imaging.readers.camera_raw import CameraRaw
 from nerif.imaging.readers.frame_numbers import numbers_in_names
 from nerif.imaging.readers.frames import Frames, check_count, check_size
@@ -91,18 +91,14 @@ class FileFrames(Frames):
 
     def load(self, i: int) -> np.ndarray:
         k, inner = self._places[i]
-        try:
+        with within(self.name(i)):
             return self._open(k).read(inner)
-        except InputError as error:
-            raise error.inside(self.name(i)) from None
 
     def _metadata(self, read: Callable[[ImageFile, str], Value], default: Value) -> Value:
         """Metadata of the first readable file."""
         for k, name in enumerate(self._names):
-            try:
+            with suppress(Exception):  # reported when the frame is read
                 return read(self._open(k), name)
-            except Exception:  # reported when the frame is read
-                continue
         return default
 
     @cached_property
@@ -269,9 +265,6 @@ def _quiet() -> Iterator[None]:
 class Png(ImageFile):
     """A PNG file, checked for its end, which OpenCV does not do."""
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
-
     def read(self, i: int) -> np.ndarray:
         import cv2
 
@@ -317,9 +310,6 @@ def _significant_bits(chunks: dict[bytes, bytes]) -> int | None:
 
 class Image(ImageFile):
     """An image that Pillow reads; of others by such a name, EPS would start Ghostscript."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
 
     def read(self, i: int) -> np.ndarray:
         from PIL import Image as Pillow
@@ -381,14 +371,7 @@ class LaVision(ImageFile):
 
 
 def _lvpyio() -> Any:
-    try:
-        import lvpyio
-    except ImportError:
-        raise InputError(
-            f"expected the package lvpyio, which is not installed; {install('lavision')} (LaVision's own terms)",
-            field="LaVision files (.im7, .vc7)",
-        ) from None
-    return lvpyio
+    return optional("lvpyio", "lavision", "LaVision files (.im7, .vc7)", " (LaVision's own terms)")
 
 
 NETPBM_HEAD = re.compile(rb"P([2356])" + 3 * rb"(?:\s|#[^\n]*\n)+(\d{1,9})" + rb"\s")

@@ -18,16 +18,7 @@ from jaxtyping import Bool
 
 from nerif.common.conventions import InputError
 from nerif.common.files import check_file, ending, local_path
-from nerif.common.image_names import (
-    ARRAYS,
-    EXPORTS,
-    FOLDER_SUFFIXES,
-    HDF5,
-    PHOTRON,
-    SINGLE_SUFFIXES,
-    SUFFIXES,
-    VIDEO,
-)
+from nerif.common.image_names import ARRAYS, EXPORTS, FOLDER_SUFFIXES, HDF5, PHOTRON, SINGLE_SUFFIXES, SUFFIXES, VIDEO
 from nerif.imaging.readers.array_files import ArrayFrames, Hdf5Frames
 from nerif.imaging.readers.binning import binned_mask
 from nerif.imaging.readers.cine import CineFrames
@@ -87,9 +78,7 @@ def read_mask(
 ) -> Bool[np.ndarray, "row column"]:  # fmt: skip
     """Read a mask from an image of `shape`, of 1 bit or more: True above the middle of its range.
 
-    Parameters
-    ----------
-    say : called with a line about a mask of twice the size, which is binned; None to refuse it
+    One of twice the size is binned and reported by `say`, or refused if that is None.
     """
     frames = open_frames(path)
     try:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import struct
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import UInt16
@@ -18,9 +17,6 @@ STAMP = 14  # pixels, each with two decimal digits: four of the image number, ye
 
 class B16(ImageFile):
     """An image of 16 bit, row by row from the top. (pco.edge manual, "Image file formats")"""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
 
     def read(self, i: int) -> np.ndarray:
         data = self._path.read_bytes()

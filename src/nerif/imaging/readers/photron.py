@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from nerif.common.conventions import InputError
-from nerif.common.files import ending
-from nerif.imaging.readers.frames import Frames, check_count, check_size
+from nerif.common.files import ending, reading
+from nerif.imaging.readers.frames import FilmFrames, check_count, check_size
 from nerif.imaging.readers.packed import unpack
 
 __all__ = ["PhotronFrames"]
@@ -31,7 +31,7 @@ TAGS = {
 """Keys of a .cih header and their places in the XML of a .cihx header."""
 
 
-class PhotronFrames(Frames):
+class PhotronFrames(FilmFrames):
     """A Photron recording, of which every n-th frame was saved (Save Step n); the time of frame i is i n / rate."""
 
     def __init__(self, path: Path, name: str) -> None:
@@ -40,22 +40,16 @@ class PhotronFrames(Frames):
         self._path = path if is_data else _partner(path, name, (".mraw",))
         self._name = Path(name).with_name(self._path.name).as_posix()
         cih = _header(header_path, Path(name).with_name(header_path.name).as_posix())
-        self._stored, self._frames = int(cih["Color Bit"]), int(cih["Total Frame"])
+        self._stored, self._length = int(cih["Color Bit"]), int(cih["Total Frame"])
         self._height, self._width = int(cih["Image Height"]), int(cih["Image Width"])
         stored = self._path.stat().st_size * 8 / (self._height * self._width * self._stored)
         check_size((self._height, self._width), self._path, name=name)
-        check_count(self._frames, stored, name)
+        check_count(self._length, stored, name)
         self.metadata_bits = min(int(cih["EffectiveBit Depth"]), self._stored)
         upper = self._stored == 16 and cih.get("EffectiveBit Side", "").lower() == "higher"
         self._shift = self._stored - self.metadata_bits if upper else 0
         step = max(1.0, float(cih.get("Save Step") or 1))  # some cameras write 0 for every frame
-        self.times = np.arange(self._frames) * step / float(cih["Record Rate(fps)"])
-
-    def __len__(self) -> int:
-        return self._frames
-
-    def name(self, i: int) -> str:
-        return f"{self._name} frame {i}"
+        self.times = np.arange(self._length) * step / float(cih["Record Rate(fps)"])
 
     def load(self, i: int) -> np.ndarray:
         pixels = self._height * self._width
@@ -75,7 +69,7 @@ class PhotronFrames(Frames):
         data = np.fromfile(self._path, np.uint8, end - begin, offset=begin)
         if len(data) < end - begin:
             raise InputError(
-                f"expected {self._frames} frames by the header, the file of {self._path.stat().st_size} bytes ends "
+                f"expected {self._length} frames by the header, the file of {self._path.stat().st_size} bytes ends "
                 "within this one or before; copy it again",
                 field=self.name(i),
             )
@@ -94,16 +88,13 @@ def _partner(path: Path, name: str, suffixes: tuple[str, ...]) -> Path:
 
 def _header(path: Path, name: str) -> dict[str, str]:
     """Return the entries of a header by the keys of a .cih."""
-    try:
+    with reading("cannot be read as a Photron header; export it again", name):
         text = path.read_bytes().decode("utf-8", errors="ignore")
         cih = _from_xml(text) if ending(path) == ".cihx" else _from_lines(text)
         *counts, rate = (float(cih[key]) if key == NUMBERS[-1] else int(cih[key]) for key in NUMBERS)
         positive = min(*counts, rate) > 0
         float(cih.get("Save Step") or 1)
         kind, stored = cih["File Format"], int(counts[0])
-    except (KeyError, ValueError, ElementTree.ParseError) as error:
-        reason = f"no {error}" if isinstance(error, KeyError) else str(error)
-        raise InputError(f"cannot be read as a Photron header ({reason}); export it again", field=name) from None
     if kind.lower() != "mraw" or stored not in (8, 12, 16):
         raise InputError(
             f"expected a monochrome MRaw recording of 8, 12 or 16 bit, got {kind} of {stored} bit; "
@@ -112,8 +103,7 @@ def _header(path: Path, name: str) -> dict[str, str]:
         )
     if not positive:
         raise InputError(
-            f"expected {', '.join(NUMBERS)} above 0, got {', '.join(cih[key] for key in NUMBERS)}",
-            field=name,
+            f"expected {', '.join(NUMBERS)} above 0, got {', '.join(cih[key] for key in NUMBERS)}", field=name
         )
     return cih
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
+from contextlib import suppress
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -11,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from nerif.common.conventions import InputError
-from nerif.common.installation import install
-from nerif.imaging.readers.frames import Frames, check_size
+from nerif.common.installation import optional
+from nerif.imaging.readers.frames import FilmFrames, check_size
 
 __all__ = ["VideoFrames"]
 
@@ -26,7 +27,7 @@ Packet = tuple[int | None, int | None, bool]
 """Time of presentation, time of decoding, and whether it is a key frame."""
 
 
-class VideoFrames(Frames):
+class VideoFrames(FilmFrames):
     """A film; the decoder stays where it last read, so that successive frames are decoded once.
 
     A frame is found by its time of presentation, from the key frame before it. AVI has no such times: where its codec
@@ -92,13 +93,9 @@ class VideoFrames(Frames):
             notes.append(f"has {len(self)} of the {self._expected} frames of its header; truncated? Copy it again")
         if self._rate:
             notes.append(f"times by its {self._rate:g} frames per second; if it was recorded faster, set --frame-rate")
-        try:
-            with self._lock:
-                is_interlaced = self._frame(0).interlaced_frame
-            if is_interlaced:
+        with suppress(Exception), self._lock:  # reported when the frame is read
+            if self._frame(0).interlaced_frame:
                 notes.append("interlaced: its even and uneven rows show different instants; record progressive frames")
-        except Exception:  # reported when the frame is read
-            pass
         return tuple(f"{self._name}: {note}" for note in notes)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -107,12 +104,6 @@ class VideoFrames(Frames):
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state, _film=None, _decoded=iter(()), _lock=threading.Lock())
-
-    def __len__(self) -> int:
-        return self._length
-
-    def name(self, i: int) -> str:
-        return f"{self._name} frame {i}"
 
     def load(self, i: int) -> np.ndarray:
         with self._lock:
@@ -192,12 +183,6 @@ def _brightness(frame: Any, name: str) -> np.ndarray:
 
 
 def _av() -> Any:
-    try:
-        import av
-    except ImportError:
-        raise InputError(
-            f"expected the package av (PyAV), which is not installed; {install('video')}, or export the frames as TIFF",
-            field="films (.avi, .mp4, .mov, .mkv)",
-        ) from None
+    av = optional("av", "video", "films (.avi, .mp4, .mov, .mkv)", ", or export the frames as TIFF")
     av.logging.set_level(av.logging.FATAL)  # FFmpeg writes errors to the console, which the exceptions repeat
     return av

@@ -47,22 +47,12 @@ from nerif.imaging.readers.mosaic import PATTERNS
 from nerif.imaging.readers.open import open_frames, read_mask
 
 __all__ = [
-    "BEFORE",
-    "SOURCES",
-    "VIEWS",
-    "View",
-    "ViewFrames",
-    "find_views",
-    "good_images",
-    "paired",
-    "read_sample",
-    "views_file",
-    "words_of_range",
-    "write_crops",
+    "BEFORE", "SOURCES", "VIEWS", "View", "ViewFrames", "find_views", "good_images", "paired", "read_sample",
+    "views_file", "words_of_range", "write_crops",
 ]  # fmt: skip
 
 TOGETHER = (("target", "background"), ("reference", "flow"))
-"""ViewFrames that are compared: if one of the two is binned, so is the other."""
+"""Images that are compared: if one of the two is binned, so is the other."""
 
 CROP = tuple(f.name for f in fields(Crop))
 HEADS = (*(suffix for suffix in SUFFIXES if suffix != ".mraw"), *EXPORTS)
@@ -193,10 +183,7 @@ class View:
     ) -> Bool[np.ndarray, "row column"] | None:  # fmt: skip
         """Return the drawn mask of the view, "mask" or "region", or None.
 
-        Parameters
-        ----------
-        shape : height and width of the view's images, px; a mask of binned images may have twice the size
-        say : called with a line about such a mask
+        The shape is that of the view's images, px; a mask of binned images may have twice the size, which is reported.
         """
         if source not in self.sources:
             return None
@@ -253,12 +240,7 @@ def words_of_range(numbers: Sequence[int]) -> str:
 def find_views(
     folder: Path, only: Sequence[str] = (), frame_offsets: Mapping[str, int] = MappingProxyType({})
 ) -> tuple[View, ...]:
-    """Find the views of an experiment: those named in `only`, or all.
-
-    Parameters
-    ----------
-    frame_offsets : by the names of views; others keep theirs
-    """
+    """Find the views of an experiment: those named in `only`, or all; frame offsets by the names of some views."""
     with reading_as(folder, EXPERIMENT):
         return _find(folder, only, frame_offsets)
 
@@ -275,12 +257,8 @@ def _find(folder: Path, only: Sequence[str], frame_offsets: Mapping[str, int]) -
             field=folder,
         )
     names = [v.name for v in views]
-    for name in only:
-        if name not in names:
-            raise InputError(f"expected some of {', '.join(names)}, got '{name}'", field="views")
-    for name in frame_offsets:
-        if name not in names:
-            raise InputError(f"expected some of {', '.join(names)}, got '{name}'", field="frame_offset")
+    check_known(only, names, "views", "view", f" of {', '.join(names)}")
+    check_known(frame_offsets, names, "frame_offset", "view", f" of {', '.join(names)}")
     views = [replace(v, frame_offset=frame_offsets.get(v.name, v.frame_offset)) for v in views]
     return tuple(v for v in views if not only or v.name in only)
 
@@ -334,17 +312,13 @@ def _from_file(file: Path) -> list[View]:
                 raise InputError(f"'{key}' of view '{name}': expected {kind.__name__}, got {value!r}", field=file)
         mosaic = entries.get("mosaic", "")
         if mosaic not in ("", "none", *PATTERNS):
-            raise InputError(
-                f"'mosaic' of view '{name}': expected {', '.join(PATTERNS)} or none, got '{mosaic}'", field=file
-            )
-        crop = {k: v for k, v in entries.items() if k in CROP}
+            expected = f"expected {', '.join(PATTERNS)} or none"
+            raise InputError(f"'mosaic' of view '{name}': {expected}, got '{mosaic}'", field=file)
+        crop, paths = ({k: v for k, v in entries.items() if k in keys} for keys in (CROP, SOURCES))
         sources = {
-            k: str(local_path(v, file.parent, f"{file}: {k} of view '{name}'"))
-            for k, v in entries.items()
-            if k in SOURCES
+            k: str(local_path(v, file.parent, f"{file}: {k} of view '{name}'")) for k, v in paths.items()
         }
-        crop_of_view = Crop(**crop) if crop else None
-        views.append(View(name, file.parent, sources, crop_of_view, mosaic, entries.get(OFFSET)))
+        views.append(View(name, file.parent, sources, Crop(**crop) if crop else None, mosaic, entries.get(OFFSET)))
     return views
 
 

@@ -17,8 +17,7 @@ import numpy as np
 import torch
 
 from nerif.common.conventions import InputError
-from nerif.common.files import atomic
-from nerif.common.netcdf import reading
+from nerif.common.files import atomic, reading
 from nerif.common.settings import with_present_names
 from nerif.data.kinds import SEQUENCE_KIND, SEQUENCE_RESULT, check_kind
 from nerif.data.measurement_file import BODIES, bodies_of

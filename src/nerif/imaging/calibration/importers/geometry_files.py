@@ -6,14 +6,15 @@ TIGRE: numpy.savez(path, **vars(geo), angles=angles)
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from nerif.common.conventions import InputError
+from nerif.common.conventions import InputError, within
+from nerif.common.files import reading
 from nerif.common.npz import open_npz
 from nerif.data.cameras_file import CalibratedCamera
 from nerif.geometry.astra import camera_of, from_astra
@@ -27,14 +28,9 @@ TIGRE = ("angles", "DSO", "DSD", "nDetector", "dDetector")
 
 
 def read_geometry(path: Path, say: Callable[[str], None]) -> list[CalibratedCamera]:
-    """Read the cameras, without backgrounds.
-
-    Parameters
-    ----------
-    say : called with a line about views whose images have to be turned upside down
-    """
+    """Read the cameras, without backgrounds; `say` reports views whose images have to be turned upside down."""
     entries = _entries(path)
-    try:
+    with reading("expected the numbers of a geometry", path), within(path):
         if set(ASTRA) <= entries.keys():
             kind, rows, size = from_astra(entries)
         elif set(TIGRE) <= entries.keys():
@@ -44,10 +40,6 @@ def read_geometry(path: Path, say: Callable[[str], None]) -> list[CalibratedCame
             raise InputError(f"expected {', '.join(ASTRA)} (ASTRA) or {', '.join(TIGRE)} (TIGRE), got {got}")
         names = [str(name) for name in entries.get("views", [f"{UNNAMED}{i + 1}" for i in range(len(rows))])]
         results = [camera_of(kind, row, size, name) for row, name in zip(rows, names, strict=True)]
-    except InputError as error:
-        raise error.inside(path) from None
-    except (TypeError, ValueError) as error:
-        raise InputError(f"expected the numbers of a geometry ({error})", field=path) from None
     if upside_down := [camera.name for camera, reversed_rows in results if reversed_rows]:
         say(
             f"{path.name}: detectors seen from behind, as usual in tomography; turn the images upside down "
@@ -56,12 +48,7 @@ def read_geometry(path: Path, say: Callable[[str], None]) -> list[CalibratedCame
     sizes = np.asarray(entries.get("image_size", [size] * len(rows)))
     return [
         CalibratedCamera.from_values(
-            f"{path}: {c.name}",
-            c.name,
-            c.intrinsics,
-            c.rotation,
-            c.translation,
-            image_size=sizes[i],
+            f"{path}: {c.name}", c.name, c.intrinsics, c.rotation, c.translation, image_size=sizes[i],
             projection=c.projection.name,
         )
         for i, (c, _) in enumerate(results)
@@ -71,15 +58,8 @@ def read_geometry(path: Path, say: Callable[[str], None]) -> list[CalibratedCame
 def _entries(path: Path) -> dict[str, Any]:
     """Return the arrays of a file; those of Python objects, such as None, are left out."""
     entries: dict[str, Any] = {}
-    try:
-        with open_npz(path) as (archive, shapes):
-            for key in shapes:
-                try:
-                    entries[key] = archive[key]
-                except ValueError:  # an object
-                    continue
-    except InputError:
-        raise
-    except (OSError, ValueError, AttributeError, TypeError, EOFError, zipfile.BadZipFile):
-        raise InputError("not a file of numpy.savez, or truncated", field=path) from None
+    with reading("not a file of numpy.savez, or truncated", path), open_npz(path) as (archive, shapes):
+        for key in shapes:
+            with suppress(ValueError):  # of an object
+                entries[key] = archive[key]
     return entries

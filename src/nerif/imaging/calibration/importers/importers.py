@@ -51,7 +51,7 @@ def import_cameras(
     settings: ImportSettings = STANDARD,
     only: Sequence[str] = (),
     say: Callable[[str], None] = lambda line: None,
-) -> tuple[CalibratedCamera, ...]:
+) -> tuple[CalibratedCamera, ...]:  # fmt: skip
     """Read the cameras of a file, or of a folder with one file per camera or with COLMAP's; errors name the file.
 
     Parameters
@@ -59,7 +59,6 @@ def import_cameras(
     path : .toml, .csv, .yml, .yaml, .xml (OpenCV, ROS, kalibr), .json (NeRF), .mat (MATLAB), .npz (ASTRA, TIGRE),
         .ori (OpenPTV), cameras.txt (COLMAP)
     only : names of the cameras to read; all if empty
-    say : called with lines about what was read
     """
     path = Path(path)
     with reading_as(path, CALIBRATION, ignore=(ARRAYS, IMAGES)):
@@ -68,9 +67,7 @@ def import_cameras(
         raise InputError("holds no camera", field=path)
     check_names(cameras, str(path))
     names = [c.name for c in cameras]
-    for name in only:
-        if name not in names:
-            raise InputError(f"expected some of {', '.join(names)}, got '{name}'", field="views")
+    check_known(only, names, "views", "camera", f" of {', '.join(names)}")
     settings = replace(settings, scale_mm=settings.scale_mm or unit)
     return tuple(check_camera(_completed(c, settings), str(path)) for c in cameras if not only or c.name in only)
 
@@ -88,12 +85,9 @@ def _read(path: Path, settings: ImportSettings, say: Callable[[str], None]) -> t
         return read_openptv(path), 1.0
     if path.is_dir() or ending(path) in YAML:
         return read_yaml_files(path, say)
-    if ending(path) == ".mat":
-        return read_matlab(path, settings.pose), 1.0
-    if ending(path) == ".npz":
-        return read_geometry(path, say), 1.0
-    if ending(path) in READERS:
-        return READERS[ending(path)](path), 1.0
+    readers = {".mat": lambda p: read_matlab(p, settings.pose), ".npz": lambda p: read_geometry(p, say), **READERS}
+    if ending(path) in readers:
+        return readers[ending(path)](path), 1.0
     raise InputError(
         f"expected a calibration ending in {' '.join(ENDINGS)}, or COLMAP's cameras.txt, got '{path.name}'", field=path
     )
@@ -137,12 +131,7 @@ def _completed(camera: CalibratedCamera, settings: ImportSettings) -> Calibrated
         shift, turn = settings.pose_sigma
         sigma = torch.tensor([math.radians(turn)] * 3 + [shift] * 3, dtype=torch.float64)
     return replace(
-        camera,
-        intrinsics=intrinsics,
-        distortion=distortion,
-        translation=scale * camera.translation,
-        image_size=camera.image_size or settings.image_size,
-        background=plane,
-        lens=_lens(camera.lens, settings),
+        camera, intrinsics=intrinsics, distortion=distortion, translation=scale * camera.translation,
+        image_size=camera.image_size or settings.image_size, background=plane, lens=_lens(camera.lens, settings),
         pose_sigma=sigma,
-    )
+    )  # fmt: skip

@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 
 from nerif.common.conventions import InputError
+from nerif.common.files import reading
 from nerif.common.hdf5 import open_hdf5
 from nerif.common.memory import check_memory
 from nerif.data.cameras_file import CalibratedCamera, check_distortion, check_model, flat, numbers
@@ -50,18 +51,12 @@ def read_matlab(path: Path, pose: int = 1) -> list[CalibratedCamera]:
     import h5py
     import pymatreader
 
-    try:
+    with reading("not a readable MATLAB file", path), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # unreadable objects are reported below
         if h5py.is_hdf5(path):  # pymatreader opens the file itself, and reads all of it
             with open_hdf5(path) as file:
                 file.visititems(lambda name, item: check_memory(getattr(item, "nbytes", 0), path, f"{path}: {name}"))
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # unreadable objects are reported below
-            content = pymatreader.read_mat(str(path))
-    except InputError:
-        raise
-    except Exception as error:  # of SciPy and h5py, of many kinds
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputError(f"not a readable MATLAB file ({reason})", field=path) from None
+        content = pymatreader.read_mat(str(path))
     objects = _objects(path, content)
     if "__function_workspace__" in content and not objects:
         objects = ["params"]

@@ -67,10 +67,7 @@ def cameras_by_view(
     views : all views of the experiment, in order
     say : called with the pairs by order
 
-    Raises
-    ------
-    InputError
-        If cameras have no names and the views are more or fewer.
+    Raises InputError if cameras have no names and the views are more or fewer.
     """
     names = {camera.name: camera for camera in cameras}
     numbers = [int(match[1]) for name in names if (match := NUMBER.fullmatch(name))]

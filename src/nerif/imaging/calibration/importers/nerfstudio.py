@@ -10,13 +10,7 @@ import torch
 
 from nerif.common.conventions import InputError
 from nerif.common.files import read_json
-from nerif.data.cameras_file import (
-    CalibratedCamera,
-    check_distortion,
-    check_model,
-    check_program,
-    numbers,
-)
+from nerif.data.cameras_file import CalibratedCamera, check_distortion, check_model, check_program, numbers
 from nerif.imaging.calibration.importers.names import named_by_images
 
 __all__ = ["read_transforms"]
@@ -48,8 +42,8 @@ def _camera(entries: dict[str, Any], where: str) -> CalibratedCamera:
         check_model(model, where)
     check_distortion(entries, COEFFICIENTS, COEFFICIENTS, where)
 
-    def number(key: str) -> float:
-        return float(numbers(entries[key], (), f"{where}: {key}"))
+    def number(key: str, default: float = 0.0) -> float:
+        return float(numbers(entries.get(key, default), (), f"{where}: {key}"))
 
     size = (number("h"), number("w")) if {"h", "w"} <= entries.keys() else None
     if "fl_x" in entries:
@@ -58,20 +52,11 @@ def _camera(entries: dict[str, Any], where: str) -> CalibratedCamera:
         fx = 0.5 * size[1] / math.tan(0.5 * number("camera_angle_x"))
     else:
         raise InputError("no focal length; expected fl_x, or camera_angle_x and w", field=where)
-    fy = number("fl_y") if "fl_y" in entries else fx
     if size is None and not {"cx", "cy"} <= entries.keys():
         raise InputError("no principal point; expected cx and cy, or w and h", field=where)
     height, width = size or (0, 0)
-    cx = (number("cx") if "cx" in entries else width / 2) - 0.5
-    cy = (number("cy") if "cy" in entries else height / 2) - 0.5
+    fy, cx, cy = number("fl_y", fx), number("cx", width / 2) - 0.5, number("cy", height / 2) - 0.5
     to_world = numbers(entries.get("transform_matrix", []), (4, 4), f"{where}: transform_matrix")
     rotation = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)) @ to_world[:3, :3].T
-    return CalibratedCamera.from_values(
-        where,
-        "",
-        [[fx, 0, cx], [0, fy, cy], [0, 0, 1]],
-        rotation,
-        -rotation @ to_world[:3, 3],
-        [number(k) if k in entries else 0.0 for k in COEFFICIENTS],
-        size,
-    )
+    k, coefficients = [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], [number(key) for key in COEFFICIENTS]
+    return CalibratedCamera.from_values(where, "", k, rotation, -rotation @ to_world[:3, 3], coefficients, size)

@@ -11,13 +11,8 @@ from typing import Any
 import numpy as np
 
 from nerif.common.conventions import InputError
-from nerif.data.cameras_file import (
-    CalibratedCamera,
-    check_distortion,
-    check_model,
-    check_program,
-    flat,
-)
+from nerif.common.files import reading
+from nerif.data.cameras_file import CalibratedCamera, check_distortion, check_model, check_program, flat
 
 __all__ = ["read_opencv", "read_storage"]
 
@@ -38,17 +33,11 @@ CONTENT = {INTRINSICS: "the camera matrices M1, D1, M2, D2", EXTRINSICS: "the po
 
 
 def read_opencv(
-    files: Mapping[Path, dict[str, Any]],
-    beside: Callable[[], dict[Path, dict[str, Any]]],
-    say: Callable[[str], None],
+    files: Mapping[Path, dict[str, Any]], beside: Callable[[], dict[Path, dict[str, Any]]], say: Callable[[str], None]
 ) -> list[CalibratedCamera]:
     """Read the cameras of a file, or of several with one camera each, named by the file.
 
-    Parameters
-    ----------
-    files : entries by file
-    beside : returns the other files in the folder, for the second one of a stereo pair
-    say : called with a line about files that are read together
+    `beside` returns the other files in the folder, for the second one of a stereo pair, which is reported.
     """
     cameras: dict[str, CalibratedCamera] = {}
     origins: dict[str, Path] = {}
@@ -66,9 +55,7 @@ def read_opencv(
 
 
 def _joined(
-    files: Mapping[Path, dict[str, Any]],
-    beside: Callable[[], dict[Path, dict[str, Any]]],
-    say: Callable[[str], None],
+    files: Mapping[Path, dict[str, Any]], beside: Callable[[], dict[Path, dict[str, Any]]], say: Callable[[str], None]
 ) -> dict[Path, dict[str, Any]]:  # fmt: skip
     """Return the files with the two of a stereo pair as one: camera matrices, and the pose of the second camera."""
     halves = [path for path, values in files.items() if _half(values)]
@@ -167,21 +154,17 @@ def read_storage(path: Path) -> dict[str, Any]:
     """Read all entries: matrices, sequences as arrays of objects, texts and numbers; None for anything else."""
     import cv2
 
-    try:
+    with reading("not a file of OpenCV's FileStorage, ROS or kalibr, or empty", path):
         storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
         keys = storage.root().keys() if storage.isOpened() else []
-    except (cv2.error, SystemError):
-        keys = []
-    if not keys:
-        raise InputError("not a file of OpenCV's FileStorage, ROS or kalibr, or empty", field=path)
+        if not keys:
+            raise ValueError("no entries")
     check_program(keys, str(path))
     values: dict[str, Any] = {}
     for key in keys:
-        node = storage.getNode(key)
-        try:
+        with reading(f"{key}: expected a matrix as FileStorage writes it", path):
+            node = storage.getNode(key)
             value = node.mat() if node.isMap() else _plain(node)
-        except cv2.error as error:
-            raise InputError(f"{key}: expected a matrix as FileStorage writes it ({error.err})", field=path) from None
         values[key] = np.asarray(value, dtype=object) if isinstance(value, list) else value  # rows may differ in length
     storage.release()
     return values

@@ -54,9 +54,7 @@ def _sensor(folder: Path) -> tuple[tuple[int, int], tuple[float, float]]:
         )
     lines = path.read_text(encoding="utf-8", errors="replace").split("\n")
     try:
-        columns, rows, width, height, interlaced, *n = (
-            float(line) for line in lines[1 + 2 * int(lines[0]) + 3 :][:8]
-        )
+        columns, rows, width, height, interlaced, *n = (float(line) for line in lines[1 + 2 * int(lines[0]) + 3 :][:8])
     except (ValueError, IndexError):
         raise InputError("expected the parameters of OpenPTV, a number a line", field=path) from None
     if interlaced or len({*n}) != 1 or min(columns, rows, width, height) <= 0:

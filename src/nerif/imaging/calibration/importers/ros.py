@@ -36,9 +36,7 @@ def is_ros(values: Mapping[str, Any]) -> bool:
 
 
 def read_ros(
-    files: Mapping[Path, dict[str, Any]],
-    beside: Callable[[], dict[Path, dict[str, Any]]],
-    say: Callable[[str], None],
+    files: Mapping[Path, dict[str, Any]], beside: Callable[[], dict[Path, dict[str, Any]]], say: Callable[[str], None]
 ) -> list[CalibratedCamera]:
     """Read a stereo pair, or more cameras of one rectification, in m; the camera without a shift is the world."""
     path = next(iter(files))

@@ -7,6 +7,7 @@ import csv
 import math
 import re
 from collections import Counter
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -120,10 +121,8 @@ def _text(path: Path) -> str:
     else:
         encodings = [] if b"\0" in content else ["utf-8-sig", "cp1252"]
     for encoding in encodings:
-        try:
+        with suppress(UnicodeDecodeError):
             return content.decode(encoding)
-        except UnicodeDecodeError:
-            continue
     raise InputError("not a text file in UTF-8 or UTF-16", field=path)
 
 

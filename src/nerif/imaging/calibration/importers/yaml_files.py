@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -21,15 +22,9 @@ PROGRAMS = {"ROS": (read_ros, 1000.0), "kalibr": (read_kalibr, 1000.0), "OpenCV"
 
 
 def read_yaml_files(path: Path, say: Callable[[str], None]) -> tuple[list[CalibratedCamera], float]:
-    """Return the cameras of a file or folder, and its unit of length in mm.
-
-    Parameters
-    ----------
-    say : called with a line about the two files of a stereo pair, which are read together
-    """
-    files, inside = [path], path.is_dir()
-    if inside:
-        files = _files(path)
+    """Return the cameras of a file or folder, and its unit of length in mm; report two files that are read together."""
+    inside = path.is_dir()
+    files = _files(path) if inside else [path]
     if not files:
         raise InputError(f"expected calibrations ({' '.join(ENDINGS)}), got none", field=path)
     contents = {file: _content(file) for file in files}
@@ -44,12 +39,10 @@ def read_yaml_files(path: Path, say: Callable[[str], None]) -> tuple[list[Calibr
         """The other files of the program in the folder of a single file."""
         others = {}
         for file in [] if inside else _files(path.parent):
-            try:
+            with suppress(InputError):
                 of, values = _content(file)
-            except InputError:
-                continue
-            if of == program and file.name != path.name:
-                others[file] = values
+                if of == program and file.name != path.name:
+                    others[file] = values
         return others
 
     return reader({file: values for file, (_, values) in contents.items()}, beside, say), unit
@@ -71,8 +64,7 @@ def _content(file: Path) -> tuple[str, dict[str, Any]]:
 
 def _plain_yaml(file: Path) -> dict[str, Any]:
     """Return the entries of YAML without OpenCV's own types; empty for anything else."""
-    try:
+    values = None
+    with suppress(InputError):
         values = read_yaml(file)
-    except InputError:
-        return {}
     return {str(key): value for key, value in values.items()} if isinstance(values, dict) else {}
