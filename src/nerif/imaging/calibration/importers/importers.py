@@ -14,7 +14,7 @@ from pathlib import Path
 import torch
 
 from nerif.common.conventions import InputError
-from nerif.common.files import check_file, ending
+from nerif.common.files import check_file, check_known, ending
 from nerif.data.cameras_file import CalibratedCamera, check_camera, check_names, read_box
 from nerif.data.kinds import ARRAYS, CALIBRATION, IMAGES, reading_as
 from nerif.geometry import Box, Lens, Plane
