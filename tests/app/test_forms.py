@@ -126,6 +126,7 @@ def test_defaults_are_not_written():
     [
         ("views", 5.0, 5), ("f_number", 8, 8.0), ("extra_angles", "10 20.5", (10.0, 20.5)),
         ("image_size", "48, 64", (48, 64)), ("image_size", "a 4", ["a", "4"]), ("temperature", None, None),
+        ("body", "b.stl", "b.stl"), ("body", " ", None),
     ],
 )  # fmt: skip
 def test_a_control_value_becomes_that_of_the_record(name, text, value):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from html import escape
+from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from nicegui import ui
@@ -170,9 +171,10 @@ def _record_value(field: Option, value: Any) -> Any:
     if field.kind == "words":
         value = str(value or "").replace(",", " ").split()
     elif field.kind == "text":
-        value = str(value or "")
+        value = str(value or "").strip()
     if field.optional and not value and field.kind in ("words", "text"):
         return None
     with suppress(InputError):
-        return converted(field.hint, value, field.name)
+        result = converted(field.hint, value, field.name)
+        return value if isinstance(result, Path) else result  # drafts are JSON
     return value

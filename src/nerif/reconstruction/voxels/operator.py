@@ -11,14 +11,18 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerif.common.conventions import InputError
+from nerif.data.measurement import Measurement
 from nerif.fields.voxel_field import DEGREES, Boundary, VoxelField
 from nerif.forward.forward_model import ForwardModel
 from nerif.geometry import Grid, Rays
 from nerif.reconstruction.device import share_threads
+from nerif.reconstruction.voxels.levels import FINE_BIN, bins_of
 from nerif.reconstruction.voxels.plane_spacing import MAX_STEP, check_step
 from nerif.reconstruction.voxels.planes import RayBundle
 
-__all__ = ["VoxelOperator", "apply_rows", "operator_norm", "rays_through"]
+__all__ = [
+    "VoxelOperator", "apply_rows", "lens_rays", "operator_bytes", "operator_norm", "ray_counts", "rays_through",
+]  # fmt: skip
 
 # of rays through a lens, per voxel of the cone's radius in the middle of the box; of a pixel
 PAIRS_PER_VOXEL, MAX_PAIRS = 2.0, 8
@@ -201,3 +205,31 @@ def operator_norm(
         if estimate <= last * (1 + tolerance):
             break
     return estimate
+
+
+def operator_bytes(measurement: Measurement, grid: Grid, basis: str, precision: str, step: float | None) -> int:
+    """Return the memory of the operators of all techniques."""
+    dtype, per_pixel = getattr(torch, precision), lens_rays(measurement, grid)
+    return sum(
+        VoxelOperator.memory_bytes(per_pixel * rays, grid, basis, dtype, channels, step)
+        for rays, channels in ray_counts(measurement, grid)
+    )
+
+
+def ray_counts(measurement: Measurement, grid: Grid) -> list[tuple[int, int]]:
+    """Return the numbers of rays, of bins where pixels are averaged, and of channels of each technique."""
+    pixels, counts = bins_of(measurement, grid, FINE_BIN) ** 2, []
+    for o in measurement.observations:
+        rays = int(measurement.usable_for(o).sum()) // (1 if o.technique.derived else pixels)
+        counts.append((rays + 1, len(o.technique.channels)))
+    return counts
+
+
+def lens_rays(measurement: Measurement, grid: Grid) -> int:
+    """Return the largest number of rays per pixel, from a lattice of pixels of each image."""
+    most = 1
+    for camera in measurement.cameras:
+        lattice = [torch.linspace(0, n - 1, min(n, 9), dtype=camera.intrinsics.dtype) for n in camera.image_size[::-1]]
+        rays = camera.rays(torch.cartesian_prod(*lattice).reshape(-1, 2)).clip(measurement.box)
+        most = max(most, rays_through(rays, min(grid.spacing)))
+    return most

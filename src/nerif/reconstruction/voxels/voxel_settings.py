@@ -104,14 +104,14 @@ class VoxelSettings(SharedSettings):
 
     def operator_bytes(self, measurement: Measurement, grid: Grid) -> int:
         """Return the memory of the operators of all techniques."""
-        from nerif.reconstruction.voxels.voxel_cost import operator_bytes
+        from nerif.reconstruction.voxels.operator import operator_bytes
 
         return operator_bytes(measurement, grid, self.basis, self.precision, self.step)
 
     def memory_bytes(self, measurement: Measurement, grid: Grid, device: str = "cpu") -> int:
         """Return the peak memory of a run, in addition to that of the process."""
         from nerif.reconstruction.voxels import kernels_torch
-        from nerif.reconstruction.voxels.voxel_cost import lens_rays, ray_counts
+        from nerif.reconstruction.voxels.operator import lens_rays, ray_counts
 
         counts = ray_counts(measurement, grid)
         rays, numbers = sum(n for n, _ in counts), sum(n * channels for n, channels in counts)
@@ -123,7 +123,7 @@ class VoxelSettings(SharedSettings):
 
     def iteration_seconds(self, measurement: Measurement, grid: Grid, cores: int) -> float:
         """Return about the time of an iteration on cores of a usual CPU, s."""
-        from nerif.reconstruction.voxels.voxel_cost import lens_rays, ray_counts
+        from nerif.reconstruction.voxels.operator import lens_rays, ray_counts
 
         rays = sum(count for count, _ in ray_counts(measurement, grid)) * lens_rays(measurement, grid)
         return RAY_SECONDS * rays * max(grid.shape) / cores
