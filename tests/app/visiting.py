@@ -20,6 +20,7 @@ from nerif.app.pages import PAGES
 from nerif.app.project.folder import ProjectFolder
 from nerif.app.project.workspace import Workspace
 from nerif.app.server.server import _handler
+from nerif.app.views.routes import routes
 
 __all__ = ["Visitor", "visiting"]
 
@@ -129,6 +130,8 @@ async def visiting(folder: Path) -> AsyncIterator[Visitor]:
     async with user_simulation(lambda: None) as user:
         for page in PAGES:
             ui.page(page.path, response_timeout=30)(_handler(work, page))
+        for path, handler in routes(work).items():
+            app.add_api_route(path, handler)
         app.timer(0.2, work.jobs.advance)
         app.on_exception(errors.append)
         try:

@@ -105,7 +105,6 @@ class CalibrationPage:
         return name if exists else ""
 
     async def _update_form(self) -> None:
-        """Build the form of another experiment or of the other way."""
         self.views, form = {}, form_of(self.simple)
         with refusals():
             if self.experiment.value:
@@ -161,7 +160,6 @@ class CalibrationPage:
         self._show()
 
     async def _on_end(self, job: CommandRun) -> None:
-        """Show what the run wrote."""
         if job.state == "done":
             self.contents = await self.work.contents()
             await self._choose_calibration(self.work.project.relative(job.file))
@@ -196,7 +194,6 @@ class CalibrationPage:
         await self._show_images()
 
     async def _show_images(self) -> None:
-        """Show the images of the selected view."""
         view = self.views.get(self.view.value or "")
         if view is None or not self.job.view.valid:
             return

@@ -185,12 +185,11 @@ class ResultView:
         if min(volume.grid.shape) < 2:
             text_html("The field is a plane and has no isosurface.", classes="note")
             return
-        view = SurfaceView(quantity, _unit(volume), limits, level, volume.grid.box)
         surfaces = [self._surface_of(self.name, self.frame)]
         if against:
             other = await self.work.in_thread(self._open, against)
             surfaces.append(self._surface_of(against, self._nearest_frame(other, against, self.step)))
-        view.show(surfaces)
+        SurfaceView(surfaces, quantity, _unit(volume), limits, level, volume.grid.box)
 
     def _surface_of(self, name: str, frame: int) -> Surface:
         path = self.work.project.path(name)

@@ -101,10 +101,11 @@ class Surface:
 
 
 class SurfaceView:
-    """A scene with a slider for the level.
+    """Surfaces in a scene with a slider for their level.
 
     Parameters
     ----------
+    surfaces : sources of one or two surfaces
     quantity : name of the quantity
     unit : unit of the level
     limits : ends of the slider
@@ -112,9 +113,10 @@ class SurfaceView:
     box : box of the volume, mm
     """
 
-    def __init__(self, quantity: str, unit: str, limits: tuple[float, float], level: float, box: Box) -> None:
-        self.quantity, self.limits = quantity, limits
-        self.surfaces: Sequence[Surface] = ()
+    def __init__(
+        self, surfaces: Sequence[Surface], quantity: str, unit: str, limits: tuple[float, float], level: float, box: Box
+    ) -> None:
+        self.surfaces, self.quantity, self.limits = surfaces, quantity, limits
         low, high = limits
         step = round((level - low) / ((high - low) or 1.0) * STEPS)
 
@@ -127,16 +129,12 @@ class SurfaceView:
         )  # fmt: skip
         self._legend = html()
         self.scene = BoxScene(box, "Isosurface; drag to turn, scroll to zoom")
+        self._draw()
 
     def _level(self, step: int) -> float:
         """The level of a step of the slider, in the unit of the quantity."""
         low, high = self.limits
         return low + (high - low) * step / STEPS
-
-    def show(self, surfaces: Sequence[Surface]) -> None:
-        """Replace the surfaces."""
-        self.surfaces = surfaces
-        self._draw()
 
     def _draw(self) -> None:
         self.scene.clear()
