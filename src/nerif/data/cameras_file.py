@@ -143,16 +143,16 @@ def check_camera(camera: CalibratedCamera, source: str) -> CalibratedCamera:
 
 def numbers(value: Any, shape: tuple[int, ...], name: str) -> Tensor:
     """Return finite numbers of a shape, float64."""
-    expected, shown = f"{' x '.join(map(str, shape))} numbers" if shape else "a number", " ".join(repr(value).split())
+    expected, text = f"{' x '.join(map(str, shape))} numbers" if shape else "a number", " ".join(repr(value).split())
     try:
         array = torch.as_tensor(value.tolist() if isinstance(value, np.ndarray) else value, dtype=torch.float64)
     except (TypeError, ValueError, RuntimeError):
-        raise InputError(f"expected {expected}, got {shown}", field=name) from None
+        raise InputError(f"expected {expected}, got {text}", field=name) from None
     if tuple(array.shape) != shape:
         got = " x ".join(map(str, array.shape)) or "a single number"
         raise InputError(f"expected {expected}, got {got}", field=name)
     if not bool(torch.isfinite(array).all()):
-        raise InputError(f"expected finite numbers, got {shown}", field=name)
+        raise InputError(f"expected finite numbers, got {text}", field=name)
     return array
 
 
