@@ -33,7 +33,7 @@ from nerif.reconstruction.reconstructor import Reconstructor
 from nerif.reconstruction.voxels.total_variation import TotalVariation
 from nerif.simulation.simulate import simulate
 from nerif.workflow.pipeline import reconstruct_into
-from nerif.workflow.run_settings import Run
+from nerif.workflow.run_settings import RunSettings
 
 APEX, ANGLE, STREAM, BEHIND, SURFACE = (-1.0, -0.8, -9.0), 31.33, 1.2e-4, 1.245, 1.433
 PIXEL = 0.4667  # mm
@@ -189,7 +189,7 @@ def measure(
         if body == "hidden pixels only":
             measurement = replace(measurement, bodies=())
     options = dict(GAUGES[gauge]) if gauge else {}
-    run = Run(report=False, extend_open_faces=options.pop("extend_open_faces", 0.0))
+    run = RunSettings(report=False, extend_open_faces=options.pop("extend_open_faces", 0.0))
     if flow == "cut":
         measurement = replace(measurement, box=Box.cube(30.0))
     reconstructor: Reconstructor = TotalVariation(device="cpu")

@@ -29,7 +29,7 @@ from nerif.reconstruction.voxels.total_variation import TotalVariation
 from nerif.results.directory import ResultDirectory
 from nerif.simulation.simulate import simulate
 from nerif.workflow.pipeline import reconstruct_into
-from nerif.workflow.run_settings import Run
+from nerif.workflow.run_settings import RunSettings
 
 COLUMNS = {
     "phantom": "{phantom}", "views": "{views}", "pixels": "{pixels}²", "method": "{method}", "detail": "{detail}",
@@ -85,7 +85,7 @@ def measure(
     with tempfile.TemporaryDirectory(dir=folder) as temporary:
         out = Path(temporary) / "r"
         start = time.perf_counter()
-        result = reconstruct_into(out, data, reconstructor, Run(report=False, detail=detail))
+        result = reconstruct_into(out, data, reconstructor, RunSettings(report=False, detail=detail))
         seconds = time.perf_counter() - start
         metrics = ResultDirectory(out).metrics()
     scores = evaluate_volume(result.field, read_volume(truth), measurement.n_ambient)

@@ -29,7 +29,8 @@ from nerif.reconstruction.reconstructor import Reconstructor
 from nerif.reconstruction.voxels.total_variation import TotalVariation
 from nerif.results.directory import ResultDirectory
 from nerif.simulation.simulate import simulate
-from nerif.workflow.pipeline import Run, reconstruct_into
+from nerif.workflow.pipeline import reconstruct_into
+from nerif.workflow.run_settings import RunSettings
 
 EDGE = 50.0  # mm
 AVERAGED = 0.04  # of the box edge
@@ -78,7 +79,7 @@ def measure(
         write_netcdf(truth_file, [Volume(truth, grid, attributes={"n_ambient": N_AMBIENT})])
         measurement.write(data)
         start = time.perf_counter()
-        reconstruct_into(out, data, reconstructor, replace(Run(report=False), uncertainty=kind), voxels=voxels)
+        reconstruct_into(out, data, reconstructor, replace(RunSettings(report=False), uncertainty=kind), voxels=voxels)
         seconds = time.perf_counter() - start
         scores = evaluate(out, truth=truth_file)
         metrics, volumes = ResultDirectory(out).read().metrics, ResultDirectory(out).volumes()

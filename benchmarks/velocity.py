@@ -37,7 +37,7 @@ from nerif.flow.assimilation import VelocityFit
 from nerif.flow.periodic_box import PeriodicBox
 from nerif.geometry import Box, Grid, Ring
 from nerif.reconstruction.neural.presets import preset
-from nerif.simulation.particles.particle_velocity import Velocity, velocity_between
+from nerif.simulation.particles.particle_velocity import VelocityVectors, velocity_between
 from nerif.simulation.simulate import simulate
 from nerif.workflow.film_velocity import densities, velocity_of_film
 from nerif.workflow.sequence.plan import SequenceSettings
@@ -229,7 +229,7 @@ def _correlation(theta: Tensor, grid: Grid, times: list[float]) -> Tensor:
     return result
 
 
-def _on_grid(vectors: Velocity, grid: Grid) -> Tensor:
+def _on_grid(vectors: VelocityVectors, grid: Grid) -> Tensor:
     """Return vectors between the centres of windows on a grid, NaN where one of them is missing."""
     from scipy.interpolate import RegularGridInterpolator
 

@@ -25,7 +25,8 @@ from nerif.reconstruction.reconstructor import Reconstructor
 from nerif.reconstruction.voxels.total_variation import TotalVariation
 from nerif.results.directory import Result, ResultDirectory
 from nerif.results.metrics_file import Metrics
-from nerif.workflow.pipeline import Run, reconstruct_into
+from nerif.workflow.pipeline import reconstruct_into
+from nerif.workflow.run_settings import RunSettings
 
 BAD, GOOD = 0.05, 0.02  # of the variation
 GOAL = 0.03
@@ -50,7 +51,7 @@ def measure(folder: Path, number: int, method: str, steps: int, pixels: int, vox
         settings = NeRIF(max_steps=steps * case.effort, points_per_batch=2048, seed=number, device="cpu")
     with tempfile.TemporaryDirectory(dir=folder) as directory:
         out, truth = Path(directory) / "r", Path(directory) / "truth.nc"
-        reconstruct_into(out, case.measurement, settings, Run(report=False), voxels=voxels)
+        reconstruct_into(out, case.measurement, settings, RunSettings(report=False), voxels=voxels)
         metrics = ResultDirectory(out).metrics()
         volume = Volume(case.truth.sample(grid), grid, attributes={"n_ambient": case.measurement.n_ambient})
         write_netcdf(truth, [volume])

@@ -31,7 +31,7 @@ from nerif.reconstruction.progress import Monitor
 from nerif.report.meridian_figure import draw_centre_line, draw_section
 from nerif.results.directory import ResultDirectory
 from nerif.workflow.pipeline import reconstruct_into
-from nerif.workflow.run_settings import Run
+from nerif.workflow.run_settings import RunSettings
 
 HARMONICS = 3  # of a cell
 DRAWS = 200  # of the bootstrap
@@ -172,9 +172,9 @@ def main() -> None:
     measurement.write(arguments.out / "jet.nc")
     method = NeRIF(symmetry="axis", open_faces=("z-", "z+"), time_limit=arguments.seconds, source="displacements")
     for name, settings, run in (
-        ("half", method, Run(withhold=("right",))),
-        ("displacements", method, Run()),
-        ("images", replace(method, source="images"), Run(withhold=("none",))),
+        ("half", method, RunSettings(withhold=("right",))),
+        ("displacements", method, RunSettings()),
+        ("images", replace(method, source="images"), RunSettings(withhold=("none",))),
     ):
         print(f"-- {name}")
         reconstruct_into(

@@ -48,7 +48,7 @@ print(nerif.check_consistency(measurement).findings or "corrected: No problems f
 # writes a directory with the report. ``uncertainty="fast"`` adds standard deviations.
 folder = Path(tempfile.mkdtemp())
 method = nerif.preset("fast", max_steps=300)
-run = nerif.Run(uncertainty="fast", report=False)
+run = nerif.RunSettings(uncertainty="fast", report=False)
 nerif.reconstruct_into(folder / "result", measurement, method, run, voxels=48)
 result = nerif.ResultDirectory(folder / "result").read()
 for view in result.metrics.cross_validation["views"]:

@@ -62,7 +62,7 @@ measurement
 # A network of (r, h). The axis is refined together with the field. The jet enters and leaves the image through its
 # lower and upper edge: the open faces.
 method = nerif.preset("fast", symmetry="axis", open_faces=("z-", "z+"), max_steps=200)
-run = nerif.Run(report=False, detail="off")
+run = nerif.RunSettings(report=False, detail="off")
 nerif.reconstruct_into(folder / "result", measurement, method, run, voxels=64)
 result = nerif.ResultDirectory(folder / "result").read()
 

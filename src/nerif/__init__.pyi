@@ -41,6 +41,7 @@ from .simulation.simulation import Simulation as Simulation
 from .workflow.pipeline import reconstruct_into as reconstruct_into
 from .workflow.reports import write_report as write_report
 from .workflow.run_settings import Run as Run
+from .workflow.run_settings import RunSettings as RunSettings
 from .workflow.sequence.plan import SequenceSettings as SequenceSettings
 from .workflow.sequence.reconstruct_sequence import reconstruct_sequence as reconstruct_sequence
 

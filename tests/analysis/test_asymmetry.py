@@ -21,7 +21,7 @@ from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.results.directory import ResultDirectory
 from nerif.simulation.simulate import simulate
 from nerif.workflow.pipeline import reconstruct_into
-from nerif.workflow.run_settings import Run
+from nerif.workflow.run_settings import RunSettings
 from refusals import refused
 
 ABOUT_Z = Symmetry.about("axis", (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), 0.1)
@@ -112,7 +112,8 @@ def test_a_cross_validation_that_is_stopped_shows_its_halves(tmp_path):
     out = ResultDirectory(tmp_path / "r")
     settings = Tikhonov(voxels=12, regularisation=0.01, symmetry="axis", device="cpu")
     monitor = Monitor(lambda _: None, training=lambda title: nullcontext(lambda s: "without" in title and s.step == 2))
-    result = reconstruct_into(out.path, measured("gaussian-jet", 0.03), settings, Run(report=False), monitor=monitor)
+    data, run = measured("gaussian-jet", 0.03), RunSettings(report=False)
+    result = reconstruct_into(out.path, data, settings, run, monitor=monitor)
     assert result.outcome.reason == "interrupted"
     assert sorted(v["withheld"] for v in out.metrics().views) == [False, True]
     assert out.metrics().verdict["rating"] in RATINGS

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
@@ -24,7 +23,6 @@ from nerif.analysis.consistency import (
     predicted_by_others,
     repeatability,
     unrelated,
-    unrelated_finding,
     without_spikes,
 )
 from nerif.analysis.image_edges import cut_edges
@@ -36,7 +34,6 @@ from nerif.geometry import Box, Camera, Ring, paper_rig
 from nerif.simulation.simulate import simulate
 
 BOX = Box.cube(50.0)
-RIGS = sorted(Path(__file__).parents[3].glob("shared/data/rigs/*.nc"))
 COARSE = 12  # voxels
 
 
@@ -83,6 +80,7 @@ MISTAKES = {
     "swapped everywhere": (lambda d: d.flip(-1), "all views: u and v are swapped"),
     "sign of v everywhere": (lambda d: d * V, "all views: the sign of one component"),
     "too large": (in_view(2, lambda d: 2.5 * d), "view 60deg: displacement 2."),
+    "all signs flipped": (lambda d: -d, ""),  # a denser flow
 }
 
 
@@ -90,10 +88,11 @@ MISTAKES = {
 @pytest.mark.parametrize("name", MISTAKES)
 def test_mistakes_are_named(clean, name):
     mistake, sentence = MISTAKES[name]
-    check = check_consistency(spoilt(clean, mistake), voxels=20)
-    (finding,) = check.findings
-    assert finding.sentence.startswith(sentence)
-    assert len(check.views) == 6
+    found = check_consistency(spoilt(clean, mistake), voxels=20)
+    assert len(found.findings) == bool(sentence)
+    assert all(finding.sentence.startswith(sentence) for finding in found.findings)
+    assert any("denser" in remark for remark in found.remarks) == (not sentence)
+    assert len(found.views) == 6
 
 
 @pytest.mark.slow
@@ -129,13 +128,6 @@ def test_no_false_alarm(phantom, seed, noise, step):
     assert any("lighter" in r for r in check.remarks)
 
 
-@pytest.mark.slow
-def test_all_signs_flipped_is_a_denser_flow(clean):
-    check = check_consistency(spoilt(clean, lambda d: -d), voxels=20)
-    assert check.findings == ()
-    assert any("denser" in r for r in check.remarks)
-
-
 # -- open faces ---------------------------------------------------------------------------------------------------
 
 
@@ -165,17 +157,10 @@ def test_open_faces_show_in_the_rays_through_them(tall):
     assert "--open-faces z+" in above.sentence
 
 
-@pytest.mark.slow
-def test_open_faces_are_findings(tall):
-    check = check_consistency(tall, voxels=20)
-    assert [f.sentence.split(":")[0] for f in check.findings] == ["face z-", "face z+"]
-
-
 # -- images of a part of the flow ---------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("phantom", ["flame", "plume", "gaussian-jet", "fire"])
-@pytest.mark.parametrize("views", [1, 3, 6])
+@pytest.mark.parametrize(("phantom", "views"), [("flame", 1), ("plume", 3), ("gaussian-jet", 3), ("fire", 6)])
 @pytest.mark.parametrize(("pitch", "sides"), [(0.04, {"left", "right"}), (0.2, set())])
 def test_edges_that_cut_the_flow(phantom, views, pitch, sides):
     m = square(phantom=phantom, views=views, image_size=(20, 20), pixel_pitch=pitch, noise=0.02)
@@ -191,12 +176,11 @@ def test_a_shaken_camera_or_noise_cuts_nothing(small):
         assert cut_edges(m, m.observations[0]) == []
 
 
-@pytest.mark.parametrize(("phantom", "views"), [("flame", 3), ("fire", 4)])
-def test_views_of_a_part_of_the_flow_accuse_nothing(phantom, views):
-    m = square(phantom=phantom, views=views, image_size=(20, 20), pixel_pitch=0.04, noise=0.02)
-    check = check_consistency(m, voxels=COARSE)
-    assert (check.findings, check.corrections) == ((), {})
-    assert check.remarks[0].startswith("the images show only 6% of the box, and the displacement does not fall to zero")
+def test_views_of_a_part_of_the_flow_accuse_nothing():
+    m = square(phantom="flame", views=3, image_size=(20, 20), pixel_pitch=0.04, noise=0.02)
+    found = check_consistency(m, voxels=COARSE)
+    assert (found.findings, found.corrections) == ((), {})
+    assert found.remarks[0].startswith("the images show only 6% of the box, and the displacement does not fall to zero")
 
 
 # -- the maps by themselves ---------------------------------------------------------------------------------------
@@ -217,9 +201,9 @@ def test_camera_shake_and_missing_pixels_are_remarks(clean):
     shaken = spoilt(clean, in_view(2, lambda d: d + torch.tensor([1.5, 0.0])))
     valid = torch.ones(shaken.displacement.shape[:3], dtype=torch.bool)
     valid[0, :20] = False
-    check = check_consistency(replace(shaken, valid=valid), voxels=20)
-    assert any("view 60deg: displacement at the border (1." in r for r in check.remarks)
-    assert any("view 0deg: only 33% of its pixels" in r for r in check.remarks)
+    found = check_consistency(replace(shaken, valid=valid), voxels=20)
+    assert any("view 60deg: displacement at the border (1." in r for r in found.remarks)
+    assert any("view 0deg: only 33% valid pixels" in r for r in found.remarks)
 
 
 def test_bins_need_not_be_square():
@@ -361,14 +345,6 @@ def test_the_transform_of_an_image_fits_best(small, code):
     assert best.code == code
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("code", ["upside_down", "mirrored", "transposed", "quarter_turn"])
-def test_the_transform_of_an_image_is_named(code):
-    measurement = square(views=6, image_size=(30, 30), pixel_pitch=0.15)
-    (check,) = check_consistency(spoilt(measurement, in_view(3, TRANSFORMS[code])), voxels=16).findings
-    assert (check.code, check.views) == (code, (measurement.names[3],))
-
-
 def test_transforms_of_square_images_only(small):
     cameras = tuple(replace(c, image_size=(24, 20)) for c in small.cameras)
     codes = {c.code for c in of_one_view(0, small.observations[0], cameras)}
@@ -403,16 +379,6 @@ def agreements(m: Measurement) -> list[float]:
     return [compare(predicted_by_others(m, [i], COARSE)[i], m, i)[0] for i in range(len(m.names))]
 
 
-@pytest.mark.slow
-def test_a_rig_in_metres_is_unrelated_and_the_cause_is_named(small):
-    wrong = in_metres(small)
-    values = agreements(wrong)
-    assert unrelated(values, wrong)
-    finding = unrelated_finding(wrong, values, 8, range(4))
-    assert (finding.code, finding.views) == ("unrelated", wrong.names)
-    assert "likely translation in metres, where mm are expected: without that the agreement is 0." in finding.sentence
-
-
 CORRECT = [
     {}, {"views": 3}, {"phantom": "flame"}, {"phantom": "octahedron", "views": 3}, {"projection": "telecentric"},
     {"noise": 1.0}, {"noise": 3.0},
@@ -436,10 +402,11 @@ def test_noise_is_not_repeatable(small):
 
 @pytest.mark.slow
 def test_unrelated_views_are_the_first_finding(small):
-    check = check_consistency(in_metres(small), voxels=COARSE)
-    assert [finding.code for finding in check.findings] == ["unrelated", "inside"]
-    assert all(view.verdict == "not predicted by the others" for view in check.views)
-    assert not check.corrections
+    found = check_consistency(in_metres(small), voxels=COARSE)
+    assert [finding.code for finding in found.findings] == ["unrelated", "inside"]
+    assert "likely translation in metres, where mm are expected: without" in found.findings[0].sentence
+    assert all(view.verdict == "not predicted by the others" for view in found.views)
+    assert not found.corrections
 
 
 @pytest.mark.slow
@@ -458,15 +425,6 @@ def test_images_sorted_by_letters_are_named():
     (check,) = check_consistency(spoilt(correct, lambda d: d[order]), voxels=COARSE).findings
     assert check.code in ("reordered", "unrelated")
     assert "in alphabetical order (10 before 2)" in check.sentence
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not RIGS, reason="no rigs beside the repository")
-def test_rigs_of_files_are_not_unrelated():
-    for path in RIGS:
-        if "truth" not in path.name:
-            codes = [finding.code for finding in check_consistency(Measurement.read(path), voxels=20).findings]
-            assert "unrelated" not in codes, path
 
 
 @pytest.mark.slow

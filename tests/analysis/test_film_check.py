@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,7 +18,6 @@ from nerif.fields.voxel_field import VoxelField
 from nerif.geometry import Box, Grid, Ring
 
 BOX, N_AMBIENT, FRAMES = Box.cube(50.0), 1.00027, 14
-PLUME = Path(__file__).parents[3] / "shared/data/plume/plume.nc"
 
 
 class Frames:
@@ -103,12 +101,6 @@ def test_a_late_view_is_named_with_the_number_of_frames(synchronous, shifts):
 
 
 @pytest.mark.slow
-def test_of_seven_views_two_that_are_late_together_are_named():
-    frames = film_of([rising(i) for i in range(FRAMES)], 7)
-    assert frames_of(shifts_of(late(frames, {1: 2, 4: 2}))) == [0, 2, 0, 0, 2, 0, 0]
-
-
-@pytest.mark.slow
 def test_synchronous_and_steady_films_have_no_late_view(synchronous):
     shifts = shifts_of(synchronous)
     assert frames_of(shifts) == [0, 0, 0, 0]
@@ -129,13 +121,6 @@ def test_a_film_too_short_for_larger_offsets_is_named():
     (finding,) = late_views(shifts, {})
     assert "3 frames late, or more, as the film is too short for larger offsets" in str(finding)
     assert "too short" not in str(late_views([replace(shifts[0], at_end=False), *shifts[1:]], {})[0])
-
-
-@pytest.mark.slow
-def test_the_end_of_a_film_is_near(synchronous):
-    frames = late(film_of([rising(i) for i in range(40)], 4), {2: 2})
-    first = next(t for t in range(len(frames)) if frames_of(shifts_of(frames[t : t + 10]))[2] == 2)
-    assert [shifts_of(part)[2].at_end for part in (frames[first : first + 10], frames)] == [True, False]
 
 
 @pytest.mark.slow
@@ -197,14 +182,3 @@ def test_the_command_checks_a_store(synchronous, tmp_path, capsys):
     assert output.count("FOUND") == 1  # at one instant, with the frames exchanged, the views agree
     assert main(["check", str(film.path), "-o", str(tmp_path / "m.nc")]) == 2
     assert "out: expected none for a measurement over time" in capsys.readouterr().err
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not PLUME.is_file(), reason="no plume beside the repository")
-def test_a_late_view_of_a_simulated_plume_is_named():
-    import xarray as xr
-
-    with xr.open_dataset(PLUME) as dataset:
-        excess = torch.from_numpy(-(N_AMBIENT - 1) * dataset.theta.values.astype(np.float32))
-    frames = film_of([VoxelField.through(e, Grid(BOX, e.shape)) for e in excess], 6)
-    assert frames_of(shifts_of(late(frames, {3: -2}))) == [0, 0, 0, -2, 0, 0]

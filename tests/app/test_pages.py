@@ -12,7 +12,7 @@ from nerif.app.project.jobs import Jobs
 from nerif.cli.cli import main
 from nerif.geometry import Ring
 from nerif.results.live import read_live, read_snapshot
-from nerif.simulation.design import DesignSettings, expect
+from nerif.simulation.rig_design import DesignSettings, expect
 
 pytestmark = pytest.mark.anyio
 

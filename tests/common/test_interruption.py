@@ -22,9 +22,9 @@ from nerif.reconstruction.progress import Monitor
 from nerif.reconstruction.reconstructor import Step
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.results.directory import ResultDirectory
-from nerif.workflow import job, steps
+from nerif.workflow import reconstruction_run, steps
 from nerif.workflow.pipeline import reconstruct_into
-from nerif.workflow.run_settings import Run
+from nerif.workflow.run_settings import RunSettings
 
 QUICK = Tikhonov(voxels=8, basis="linear", iterations=4, regularisation=0.1, device="cpu")
 
@@ -87,11 +87,11 @@ def test_a_reconstruction_reports_what_is_saved_and_continues(stage, measurement
     name, first = STAGES[stage], stage == "before the first step"
     path, out = tmp_path / "m.nc", tmp_path / "r"
     measurement.write(path)
-    run = Run(withhold=("none",), report=False)
+    run = RunSettings(withhold=("none",), report=False)
     if first:  # an earlier result is not the one of this run
         reconstruct_into(out, measurement, QUICK, run, voxels=8)
     with monkeypatch.context() as patch:
-        patch.setattr(job if hasattr(job, name) else steps, name, interrupt)
+        patch.setattr(reconstruction_run if hasattr(reconstruction_run, name) else steps, name, interrupt)
         words = "nothing was saved yet" if first else "holds the field, but not all other files"
         with pytest.raises(Interrupted, match=words) as stop:
             reconstruct_into(out, path, QUICK, run, voxels=8, force=first)
@@ -106,7 +106,7 @@ def test_a_second_ctrl_c_in_the_training_leads_to_the_checkpoint(measurement, tm
         if step.step == 3:
             raise KeyboardInterrupt
 
-    run = Run(withhold=("none",), report=False, checkpoint_every=0.0)
+    run = RunSettings(withhold=("none",), report=False, checkpoint_every=0.0)
     with pytest.raises(Interrupted, match="holds the last checkpoint; continue with nerif reconstruct --resume"):
         reconstruct_into(tmp_path / "r", measurement, QUICK, run, on_step=stop)
 
@@ -119,7 +119,7 @@ def test_every_stage_of_a_reconstruction_is_reported(measurement, tmp_path):
         return Monitor().counting(title)
 
     monitor = replace(Monitor(), counting=counting)
-    reconstruct_into(tmp_path / "r", measurement, QUICK, Run(withhold=("none",)), voxels=8, monitor=monitor)
+    reconstruct_into(tmp_path / "r", measurement, QUICK, RunSettings(withhold=("none",)), voxels=8, monitor=monitor)
     assert titles == ["sampling the field", "re-projecting", "scoring the views", "writing the report"]
 
 

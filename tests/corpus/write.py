@@ -50,7 +50,7 @@ def write(folder: Path) -> None:
     nerif.Volume.of(flame.sample(grid), grid, "index_excess", 1.00027).write(folder / "volume.vti")
     for name, method in RESULTS.items():
         detail = "on" if name == "detail" else "off"
-        run = nerif.Run(report=False, withhold=("none",), detail=detail)
+        run = nerif.RunSettings(report=False, withhold=("none",), detail=detail)
         nerif.reconstruct_into(folder / name, plain, method, run, voxels=8 if name == "neural" else None)
         (folder / name / CHECKPOINT).unlink()
     film, small = f"{folder}/film.zarr", "--network.depth 2 --network.width 8 --voxels 8"

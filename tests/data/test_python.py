@@ -139,7 +139,7 @@ def test_any_file_is_read(measurement, result, tmp_path):
     assert nerif.read(tmp_path / "m.nc").names == measurement.names
     nerif.reconstruct_into(
         tmp_path / "r", measurement, nerif.Tikhonov(voxels=8, device="cpu", regularisation=1e-2),
-        nerif.Run(report=False, withhold=("none",)),
+        nerif.RunSettings(report=False, withhold=("none",)),
     )  # fmt: skip
     assert nerif.read(tmp_path / "r").metrics.views
     with refused(tmp_path / "absent"):

@@ -25,7 +25,7 @@ from nerif.results.directory import REPROJECTION, ResultDirectory
 from nerif.simulation.simulate import simulate
 from nerif.simulation.simulation import Simulation
 from nerif.workflow.pipeline import reconstruct_into
-from nerif.workflow.run_settings import Run
+from nerif.workflow.run_settings import RunSettings
 from refusals import refused
 
 RING = Ring(views=4, image_size=(14, 17), pixel_pitch=0.26)
@@ -44,7 +44,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     folder = tmp_path_factory.mktemp("techniques")
     measurements = {name: simulated(folder, name) for name in ("deflection", "emission", "interferometry")}
     for name in ("deflection", "emission"):
-        reconstruct_into(folder / name, measurements[name], QUICK, Run(report=False))
+        reconstruct_into(folder / name, measurements[name], QUICK, RunSettings(report=False))
     return measurements
 
 
@@ -65,7 +65,7 @@ def test_fields_of_another_quantity_are_refused(files, tmp_path, capsys):
     field, box, n_ambient = ResultDirectory(results["deflection"]).field()
     with refused("technique"):
         predict(field, RING.cameras(), box, n_ambient, technique=Absorption, quantity="index_excess")
-    run = Run(start_from=results["deflection"], report=False)
+    run = RunSettings(start_from=results["deflection"], report=False)
     with pytest.raises(InputError, match=r"start_from .*deflection: expected a technique .*, got emission"):
         reconstruct_into(tmp_path / "r", files["emission"], QUICK, run)
     assert not (tmp_path / "r").exists()
@@ -94,7 +94,7 @@ def test_gains_are_part_of_the_result(files, tmp_path):
     uneven = tmp_path / "uneven.nc"
     with_gains(even, {name: 1 / gain for name, gain in gains.items()}).write(uneven)
     out = ResultDirectory(tmp_path / "r")
-    reconstruct_into(out.path, uneven, QUICK, Run(fit_gains=True, report=False))
+    reconstruct_into(out.path, uneven, QUICK, RunSettings(fit_gains=True, report=False))
     about = tomllib.loads((out / "run.toml").read_text())["about"]
     assert about["gains"] == pytest.approx(fit_gains(Measurement.read(uneven)), rel=1e-6)
     before, views = out.metrics().views, out.reprojection()

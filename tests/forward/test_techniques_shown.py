@@ -23,7 +23,8 @@ from nerif.geometry import Box, Grid
 from nerif.physics.quantities import GasSettings
 from nerif.plotting import drawing
 from nerif.report import packing
-from nerif.report.journal_figures import error_of, figures_of, residuals_over_sigma, view
+from nerif.report.journal_figures import error_of, figures_of, view
+from nerif.report.result_plots import residuals_over_sigma
 from nerif.report.view_images import view_images
 from nerif.results.directory import ResultDirectory
 from nerif.workflow.sequence.plan import SequenceSettings

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
@@ -14,7 +13,6 @@ from nerif.geometry import Box, Camera, Plane, Ring, paper_rig
 from nerif.geometry.plausibility import likely_cause, rig_findings
 
 BOX = Box((-25.0, -20.0, -15.0), (20.0, 25.0, 30.0))
-RIGS = sorted(Path(__file__).parents[3].glob("shared/data/rigs/*.nc"))
 
 
 def ring(**changed) -> tuple[Camera, ...]:
@@ -141,15 +139,6 @@ RIGHT = {
 @pytest.mark.parametrize("name", RIGHT)
 def test_plausible_rigs_have_no_finding(name):
     assert rig_findings(*RIGHT[name]) == []
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not RIGS, reason="no rigs beside the repository")
-def test_rigs_of_files_are_plausible():
-    for path in RIGS:
-        if "truth" not in path.name:
-            measurement = Measurement.read(path)
-            assert rig_findings(measurement.cameras, measurement.box) == [], path
 
 
 def test_a_file_that_is_refused_says_why():

@@ -118,6 +118,6 @@ def test_tilts_of_telecentric_cameras_and_of_rings_are_refused():
         tilted(telecentric, 1.0, 0.0)
 
 
-def test_a_checkpoint_is_of_the_tilt_of_its_cameras(cameras):
-    digests = {digest(_parts(c)) for c in (cameras[0], tilted(cameras[0], 0, 0), tilted(cameras[0], 1, 0))}
-    assert len(digests) == 2
+def test_a_checkpoint_is_of_the_tilt_and_the_projection_of_its_cameras(cameras):
+    others = (tilted(cameras[0], 0, 0), tilted(cameras[0], 1, 0), replace(cameras[0], projection=TELECENTRIC))
+    assert len({digest(_parts(c)) for c in (cameras[0], *others)}) == 3

@@ -28,7 +28,7 @@ from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.results.directory import ResultDirectory
 from nerif.simulation.simulate import simulate
 from nerif.workflow.pipeline import reconstruct_into
-from nerif.workflow.run_settings import Run
+from nerif.workflow.run_settings import RunSettings
 from refusals import refused
 
 CONE = Path(__file__).parents[3] / "shared" / "data" / "body"
@@ -135,7 +135,7 @@ def test_ambient_points_and_hull_respect_bodies(flow):
 )
 def test_a_result_has_no_field_within_a_body(with_ball, tmp_path, method):
     with_ball.write(tmp_path / "m.nc")
-    run = Run(report=isinstance(method, Tikhonov))
+    run = RunSettings(report=isinstance(method, Tikhonov))
     reconstruct_into(tmp_path / "r", tmp_path / "m.nc", method, run, voxels=20)
     result = ResultDirectory(tmp_path / "r")
     inside = contained(with_ball.bodies, Grid.of_resolution(BOX, 20).points())
@@ -158,7 +158,8 @@ def test_a_result_has_no_field_within_a_body(with_ball, tmp_path, method):
 
 def test_a_result_is_compared_with_the_truth_outside_the_body(with_ball, tmp_path):
     with_ball.write(tmp_path / "m.nc")
-    reconstruct_into(tmp_path / "r", tmp_path / "m.nc", Tikhonov(voxels=20, device="cpu"), Run(report=False), voxels=20)
+    method, run = Tikhonov(voxels=20, device="cpu"), RunSettings(report=False)
+    reconstruct_into(tmp_path / "r", tmp_path / "m.nc", method, run, voxels=20)
     grid = Grid.of_resolution(BOX, 24)
     truth = make_phantom("gaussians", BOX, 0).sample(grid)
     inside = contained(with_ball.bodies, grid.points())

@@ -9,6 +9,7 @@ from dataclasses import replace
 import pytest
 import torch
 from matplotlib.figure import Figure
+from nerif.report.result_plots import draw_corrections
 
 from nerif.analysis.rig_check import check_rig
 from nerif.cli.cli import main
@@ -23,11 +24,10 @@ from nerif.reconstruction.rig_refinement import Refinement, refit
 from nerif.reconstruction.uncertainty.rig_posterior import RigPosterior
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.reconstruction.voxels.total_variation import TotalVariation
-from nerif.report.figures import draw_corrections
 from nerif.results.directory import ResultDirectory
 from nerif.simulation.simulate import simulate
 from nerif.workflow.pipeline import reconstruct_into
-from nerif.workflow.run_settings import Run
+from nerif.workflow.run_settings import RunSettings
 from refusals import refused
 
 BOX = Box((-20.0,) * 3, (20.0,) * 3)
@@ -208,7 +208,7 @@ def test_trials_refine_rigs_of_their_own_which_are_read_again(measured, tmp_path
     monkeypatch.setattr("nerif.reconstruction.uncertainty.bootstrap.VOXELS", 12)
     out, lines = ResultDirectory(tmp_path / "r"), []
     method = Tikhonov(voxels=10, iterations=4, regularisation=1e-2, refine=("cameras",), device="cpu")
-    run = Run(withhold=("none",), uncertainty="fast", report=False)
+    run = RunSettings(withhold=("none",), uncertainty="fast", report=False)
     for resume in (False, True):
         result = reconstruct_into(out.path, measured, method, run, resume=resume, monitor=Monitor(lines.append))
     assert [row["values"] for row in result.rig] == [row["values"] for row in out.rig()]

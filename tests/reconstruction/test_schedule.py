@@ -22,7 +22,7 @@ from nerif.reconstruction.reconstructor import Step
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.results.live import read_live
 from nerif.workflow.pipeline import reconstruct_into
-from nerif.workflow.run_settings import Run
+from nerif.workflow.run_settings import RunSettings
 
 SMALL = NeRIF(network=NetworkShape(depth=1, width=8, octaves=1), points_per_batch=256, device="cpu")
 
@@ -202,7 +202,7 @@ def test_a_run_shows_the_warning_in_terminal_and_app(measurement, tmp_path, slow
     slow_clock(1.0)
     lines: list[str] = []
     settings = replace(SMALL, time_limit=400.0, max_steps=1000)
-    run = Run(withhold=("auto",), report=False)
+    run = RunSettings(withhold=("auto",), report=False)
     reconstruct_into(tmp_path / "r", measurement, settings, run, voxels=8, monitor=Monitor(lines.append), live=True)
     (line,) = [line for line in lines if line.startswith("slow: ")]
     assert "1000 planned steps" in line

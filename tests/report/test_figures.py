@@ -24,11 +24,11 @@ from nerif.geometry import Box, Grid, Ring
 from nerif.imaging.calibration.result import ImageError
 from nerif.plotting import drawing
 from nerif.plotting.notebook import show_views
-from nerif.report import figures
+from nerif.report import result_plots
 from nerif.report.calibration_figure import draw_errors
 from nerif.report.displacement_figure import save_displacements
 from nerif.report.isosurface import default_level, draw_isosurface, stl_of, surface_triangles
-from nerif.report.journal_figures import figures_of, residuals_over_sigma, slices, view
+from nerif.report.journal_figures import figures_of, slices, view
 from nerif.report.journals import JOURNALS
 from nerif.report.rig_figure import draw_two_sides
 from nerif.report.slice_images import bar_image, slice_aspect, slice_image
@@ -65,8 +65,8 @@ def test_every_figure_is_complete(whole):
     expected = [*(f"slices_{q}" for q in quantities), *(f"slices_{q}_std" for q in quantities), "comparison"]
     expected += [f"isosurface_{q}" for q in quantities]
     expected += [f"view_{v}" for v in ("0deg", "56.6667deg", "113.333deg", "170deg")]
-    expected += ["residuals", "rig", "views", *(f"bands_{q}" for q in quantities)]
-    assert names == [*expected, "reliability", "history", "slice_scores"]
+    expected += ["rig", "history", "residuals", "views", *(f"bands_{q}" for q in quantities)]
+    assert names == [*expected, "reliability", "slice_scores"]
 
 
 def figure_of_a_view(size: tuple[int, int], sigma: bool) -> Figure:
@@ -119,10 +119,10 @@ def test_functions_return_the_axes_they_draw_into(volume, whole):
     for draw, *data in (
         (drawing.draw_slice, volume, "y"),
         (drawing.draw_map, np.zeros((3, 4)), (-1.0, 1.0)),
-        (figures.draw_history, result.history),
-        (figures.draw_slice_scores, result.metrics.slices),
-        (figures.draw_view_scores, result.metrics.views),
-        (figures.draw_residuals, residuals_over_sigma(result.reprojection)["displacement"]),
+        (result_plots.draw_history, result.history),
+        (result_plots.draw_slice_scores, result.metrics.slices),
+        (result_plots.draw_view_scores, result.metrics.views),
+        (result_plots.draw_residuals, result_plots.residuals_over_sigma(result.reprojection)["displacement"]),
     ):
         axes = Figure().subplots()
         assert draw(axes, *data) is axes
@@ -131,7 +131,7 @@ def test_functions_return_the_axes_they_draw_into(volume, whole):
 def test_the_curves_of_a_run_on_voxels_are_residual_penalty_and_objective():
     record = {"step": 1.0, "seconds": 1.0, "voxels": 24.0, "bin_edge": 4.0, "weight": 1e-3, "residual": 0.5}
     record |= {"penalty": 0.2, "objective": 0.7, "residual_over_sigma": 1.5}
-    axes = figures.draw_history(Figure().subplots(), [record, {**record, "seconds": 2.0, "bin_edge": 1.0}])
+    axes = result_plots.draw_history(Figure().subplots(), [record, {**record, "seconds": 2.0, "bin_edge": 1.0}])
     labels = {str(line.get_label()) for line in axes.lines}
     assert labels >= {"residual", "penalty", "objective"}
     assert not labels & {"bin edge", "voxels", "weight"}
@@ -203,9 +203,9 @@ VIEWS = Measurement((CAMERA,), torch.zeros(1, 6, 8, 2), Box((-5, -5, -5), (5, 5,
 @pytest.mark.parametrize(
     ("draw", "count"),
     [
-        (lambda figure: figures.draw_view_scores(figure.subplots(), [SCORES]), 2),
-        (lambda figure: figures.draw_corrections(figure.subplots(), [CORRECTIONS]), 1),
-        (lambda figure: figures.draw_refined_rig(figure.subplots(), [CAMERA], [CORRECTIONS]), 1),
+        (lambda figure: result_plots.draw_view_scores(figure.subplots(), [SCORES]), 2),
+        (lambda figure: result_plots.draw_corrections(figure.subplots(), [CORRECTIONS]), 1),
+        (lambda figure: result_plots.draw_refined_rig(figure.subplots(), [CAMERA], [CORRECTIONS]), 1),
         (lambda figure: draw_two_sides(figure, [CAMERA]), 2),
         (lambda figure: draw_errors(figure.subplots(), ERRORS), 1),
         (lambda figure: figure.subplots().set_title(drawing.label_of(NAME)), 1),
@@ -266,7 +266,7 @@ def test_a_small_slice_is_upright_and_at_its_index():
     assert 120 < pixels(slice_image(index, "z", 0, (0.0002, 0.0004), "gray")).mean() < 135  # n - 1
 
 
-WIDTH = 2 * figures.BAND_SIGMAS
+WIDTH = 2 * result_plots.BAND_SIGMAS
 
 
 @pytest.mark.parametrize(("quantity", "below", "above"), [("density", WIDTH, WIDTH), ("temperature", 7, 11)])
@@ -277,8 +277,8 @@ def test_bands_are_those_of_the_percentiles_else_of_the_deviation(quantity, belo
     values = {"density": ramp, "density_std": std, "temperature": 300 + ramp, "temperature_std": std}
     values |= {"temperature_p05": 293 + ramp, "temperature_p95": 311 + ramp}
     volumes = {name: Volume(x, grid, name) for name, x in values.items()}
-    assert figures.banded(volumes) == ["density", "temperature"]
-    axes = figures.draw_bands(Figure().subplots(), volumes, quantity)
+    assert result_plots.banded(volumes) == ["density", "temperature"]
+    axes = result_plots.draw_bands(Figure().subplots(), volumes, quantity)
     lines, extents = axes.get_lines(), axes.collections[0].get_paths()[0].get_extents()
     assert [line.get_label() for line in lines] == ["along x", "along y", "along z"]
     line = values[quantity][2, 3]
@@ -298,7 +298,7 @@ def test_a_reliability_diagram_is_the_diagonal_for_correct_deviations():
     assert scores["two_sigma"] == pytest.approx(0.954, abs=0.005)
     assert scores["one_sigma_in_flow"] == pytest.approx(0.683, abs=0.01)
     assert 0.2 < scores["spearman"] < 0.6
-    line = figures.draw_reliability(Figure().subplots(), scores).get_lines()[1]
+    line = result_plots.draw_reliability(Figure().subplots(), scores).get_lines()[1]
     np.testing.assert_allclose(line.get_ydata(), scores["reliability"])
     underestimated = coverage(2 * std * rng.standard_normal(std.shape), std, flow)
     assert underestimated["two_sigma_in_flow"] == pytest.approx(0.683, abs=0.02)

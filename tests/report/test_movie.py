@@ -20,7 +20,7 @@ from nerif.data.volume import Volume
 from nerif.data.volume_sequence import VolumeSequence, add_frames
 from nerif.fields.phantoms import Flame
 from nerif.geometry import Box, Grid
-from nerif.report.movie import Movie, _points, _surfaces, finished_frames, instants
+from nerif.report.volume_movie import Movie, _points, _surfaces, finished_frames, instants
 from refusals import refused
 
 SMALL = ["--quantity", "index_excess", "--size", "240", "180"]

@@ -18,7 +18,7 @@ from nerif.geometry.symmetry import Axis, Symmetry
 from nerif.physics.quantities import GasSettings, derive
 from nerif.plotting.notebook import number
 from nerif.report import html, packing
-from nerif.report.journal_figures import residuals_over_sigma
+from nerif.report.result_plots import residuals_over_sigma
 from nerif.report.scene import scene_of
 from nerif.report.summary import LEVELS, Statement, statements
 from nerif.report.view_images import _shrink, lattice_step, view_images

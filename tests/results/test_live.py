@@ -19,7 +19,7 @@ from nerif.results import live
 from nerif.results.live import Live, read_live, read_snapshot
 from nerif.simulation.simulation import Simulation
 from nerif.workflow.pipeline import reconstruct_into
-from nerif.workflow.run_settings import Run
+from nerif.workflow.run_settings import RunSettings
 
 RING = Ring(views=4, arc=(0.0, 135.0), image_size=(12, 18), pixel_pitch=0.22)
 METHODS = [NeRIF(max_steps=10, points_per_batch=256), Tikhonov(voxels=8, iterations=10, regularisation=0.1)]
@@ -35,7 +35,7 @@ def measurement():
 def test_the_status_of_a_run(measurement, method, withhold, tmp_path, monkeypatch):
     for name, value in {"FIELD_DELAY": 0.0, "FIELD_SHARE": 1e9, "COARSE_VOXELS": 8, "RAY_SAMPLES": 16}.items():
         monkeypatch.setattr(live, name, value)
-    run = Run(withhold=withhold, report=False)
+    run = RunSettings(withhold=withhold, report=False)
     result = reconstruct_into(tmp_path / "r", measurement, method, run, voxels=8, live=True)
     status, look = read_live(tmp_path / "r"), read_snapshot(tmp_path / "r")
     assert status["progress"] == 1 or isinstance(method, Tikhonov)  # which may converge before
@@ -74,7 +74,7 @@ def test_a_status_that_cannot_be_written_does_not_end_a_run(measurement, tmp_pat
     monkeypatch.setattr(live, "FIELD_DELAY", 0.0)
     monkeypatch.setattr(live, "write_json", full)
     monkeypatch.setattr(live.np, "savez", full)
-    run = Run(report=False, withhold=("none",))
+    run = RunSettings(report=False, withhold=("none",))
     assert not reconstruct_into(tmp_path, measurement, METHODS[1], run, live=True, force=True).outcome.failed
     assert [record.message for record in caplog.records] == [
         "live view: not written (OSError: [Errno 28] no space); the run goes on"
@@ -83,7 +83,8 @@ def test_a_status_that_cannot_be_written_does_not_end_a_run(measurement, tmp_pat
 
 
 def test_no_status_unless_requested(measurement, tmp_path):
-    reconstruct_into(tmp_path, measurement, Tikhonov(voxels=8), Run(report=False, withhold=("none",)), force=True)
+    run = RunSettings(report=False, withhold=("none",))
+    reconstruct_into(tmp_path, measurement, Tikhonov(voxels=8), run, force=True)
     assert read_live(tmp_path) == {}
     assert read_snapshot(tmp_path) is None
 
@@ -104,6 +105,7 @@ def test_the_field_is_written_as_often_as_its_duration_allows(
 ):
     clock, looks = [0.0], []
     monkeypatch.setattr("time.monotonic", lambda: clock[0])
+    monkeypatch.setattr(live, "STATUS_INTERVAL", 50.0)
     status = Live(tmp_path, measurement, NeRIF())
 
     def look(title, step, withheld):

@@ -14,7 +14,7 @@ from bodies import cuboid
 from nerif.cli.cli import main
 from nerif.fields.phantoms import GaussianBalls
 from nerif.geometry import Box, Ring
-from nerif.simulation.design import DesignSettings, expect
+from nerif.simulation.rig_design import DesignSettings, expect
 from nerif.simulation.simulate import view_displacement
 from refusals import refused
 

@@ -1,4 +1,4 @@
-"""A time limit is shared among the fits of a run; the steps of the pipeline own the sections of metrics.json."""
+"""A time limit is shared among the fits of a run."""
 
 from __future__ import annotations
 
@@ -12,12 +12,10 @@ from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.progress import Monitor
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.results.directory import ResultDirectory
-from nerif.results.metrics_file import Metrics
 from nerif.workflow import budget
-from nerif.workflow.budget import LEAST, NO_LIMIT, Budget
-from nerif.workflow.job import Job
-from nerif.workflow.run_settings import Run
-from nerif.workflow.steps import CLOSING, STEPS, Bootstrap, DrawErrors
+from nerif.workflow.budget import LEAST, Budget
+from nerif.workflow.reconstruction_run import ReconstructionRun
+from nerif.workflow.run_settings import RunSettings
 
 
 @pytest.fixture
@@ -31,16 +29,16 @@ def clock(monkeypatch) -> SimpleNamespace:
 def test_fits_share_the_time_beyond_the_reserve(clock):
     limit = Budget(60.0, 1000.0, 10.0)
     clock.seconds = 1005.0
-    assert limit.allot(Tikhonov(time_limit=60.0), 1 / 3).time_limit == pytest.approx(45 / 3)
+    assert limit.limited(Tikhonov(time_limit=60.0), 1 / 3).time_limit == pytest.approx(45 / 3)
     clock.seconds = 1040.0
-    assert limit.allot(NeRIF(time_limit=60.0)).time_limit == pytest.approx(10.0)
+    assert limit.limited(NeRIF(time_limit=60.0)).time_limit == pytest.approx(10.0)
     clock.seconds = 1100.0
-    assert limit.allot(NeRIF(time_limit=60.0)).time_limit == pytest.approx(LEAST * 60)  # a fit takes a few steps
+    assert limit.limited(NeRIF(time_limit=60.0)).time_limit == pytest.approx(LEAST * 60)  # a fit takes a few steps
 
 
 def test_without_a_limit_settings_stay():
     settings = NeRIF(max_steps=5)
-    assert NO_LIMIT.allot(settings, 0.1) is settings
+    assert Budget(0.0, 0.0, 0.0).limited(settings, 0.1) is settings
 
 
 def test_the_limit_counts_from_the_start_and_reserves_time_for_the_rest(measurement, clock):
@@ -87,21 +85,12 @@ def test_too_short_a_limit_is_said_before_the_cross_validation(measurement, tmp_
     lines: list[str] = []
     settings = NeRIF(network=NetworkShape(depth=1, width=8, octaves=1), time_limit=1000.0, max_steps=4, device="cpu")
     out, monitor = ResultDirectory(tmp_path / "r"), Monitor(lines.append)
-    job = Job(out, measurement, settings, Run(), voxels=8, monitor=monitor, live=True)
-    assert job.validation is not None
-    assert job.view is not None
+    run = ReconstructionRun.plan(out, measurement, settings, RunSettings(), 8, monitor=monitor).with_live_view()
+    assert run.validation is not None
     assert "--time-limit 1000 is too short" in lines[-1]
-    assert job.view.remark() == lines[-1]  # shown by the app
+    assert run.view.remark() == lines[-1]  # shown by the app
 
 
 def test_sampling_a_larger_volume_reserves_more_time(measurement):
     small, large = (Budget.of(NeRIF(time_limit=60.0, device="cpu"), measurement, n, None).reserve for n in (8, 400))
     assert large > small
-
-
-def test_every_section_of_the_metrics_belongs_to_one_step_or_to_the_evaluation():
-    assert DrawErrors.sections == Bootstrap.sections  # one or the other
-    sections = [name for step in (*STEPS, *CLOSING) if step is not DrawErrors for name in step.sections]
-    assert len(sections) == len(set(sections))
-    truth = {"truth", "quantity", "l2", "l2_variation", "cc", "ssim", "psnr", "slices", "aligned", "coverage"}
-    assert {*sections, *truth, "version"} == {field.name for field in dataclasses.fields(Metrics)}

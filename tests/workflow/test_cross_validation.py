@@ -26,12 +26,12 @@ from nerif.report.summary import accuracy_rows, statements
 from nerif.results.directory import ResultDirectory
 from nerif.workflow.cross_validation import MIN_VIEWS, CrossValidation, withheld_views
 from nerif.workflow.pipeline import reconstruct_into
-from nerif.workflow.run_settings import Run
+from nerif.workflow.run_settings import RunSettings
 
 VOXELS = Tikhonov(voxels=16, basis="linear", iterations=8, regularisation=0.1, device="cpu")
 SHAPE = NetworkShape(depth=2, width=24, octaves=2)
 NETWORK = NeRIF(network=SHAPE, max_steps=60, points_per_batch=600, precision="float32", device="cpu")
-SILENT = Run(report=False)
+SILENT = RunSettings(report=False)
 
 
 @pytest.mark.parametrize("method", [VOXELS, NETWORK], ids=["voxels", "network"])

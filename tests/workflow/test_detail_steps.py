@@ -17,8 +17,8 @@ from nerif.reconstruction.voxels.total_variation import TotalVariation
 from nerif.results.directory import ResultDirectory
 from nerif.simulation.simulate import simulate
 from nerif.workflow.pipeline import reconstruct_into
-from nerif.workflow.run_settings import Run
-from nerif.workflow.steps import MOST_BLURRED, MOST_DETAIL, share
+from nerif.workflow.run_settings import RunSettings
+from nerif.workflow.steps import MOST_BLURRED, MOST_DETAIL, detail_share
 from refusals import refused
 
 BOX = Box.around_origin((40.0, 36.0, 30.0))
@@ -41,7 +41,7 @@ def turbulence(truth):
 def made(turbulence, tmp_path_factory):
     """A result with detail and deviations, and what was said."""
     out, lines = ResultDirectory(tmp_path_factory.mktemp("detail") / "r"), list[str]()
-    run = Run(report=False, uncertainty="fast")
+    run = RunSettings(report=False, uncertainty="fast")
     result = reconstruct_into(out.path, turbulence, METHOD, run, monitor=Monitor(say=lines.append))
     return out, result, lines
 
@@ -87,9 +87,9 @@ def test_a_run_that_is_resumed_has_the_same_detail(made, turbulence, tmp_path):
         calls.append(step)
         return len(calls) == 3
 
-    stopped = reconstruct_into(path, turbulence, METHOD, Run(report=False), on_step=stop)
+    stopped = reconstruct_into(path, turbulence, METHOD, RunSettings(report=False), on_step=stop)
     assert stopped.outcome.reason == "interrupted"
-    resumed = reconstruct_into(path, turbulence, METHOD, Run(report=False), resume=True)
+    resumed = reconstruct_into(path, turbulence, METHOD, RunSettings(report=False), resume=True)
     points = torch.rand(40, 3) * 20 - 10
     expected = made[1].field(points)  # total variation has other weights after an interruption
     assert float((resumed.field(points) - expected).norm()) < 0.05 * float(expected.norm())
@@ -100,7 +100,7 @@ def test_an_interruption_loses_nothing_of_the_fit(turbulence, tmp_path, monkeypa
     def interrupt(*_):
         raise KeyboardInterrupt
 
-    run, out = Run(report=False, withhold=("none",), detail="on"), ResultDirectory(tmp_path / "r")
+    run, out = RunSettings(report=False, withhold=("none",), detail="on"), ResultDirectory(tmp_path / "r")
     with monkeypatch.context() as patch:
         patch.setattr(DetailChoice, "solve", interrupt)
         with pytest.raises((KeyboardInterrupt, SystemExit)):
@@ -114,9 +114,9 @@ def test_an_interruption_loses_nothing_of_the_fit(turbulence, tmp_path, monkeypa
 @pytest.mark.parametrize(
     ("settings", "added"),
     [
-        (Run(report=False, detail="off"), False),
-        (Run(report=False, withhold=("none",)), False),
-        (Run(report=False, withhold=("none",), detail="on"), True),
+        (RunSettings(report=False, detail="off"), False),
+        (RunSettings(report=False, withhold=("none",)), False),
+        (RunSettings(report=False, withhold=("none",), detail="on"), True),
     ],
 )
 def test_when_it_is_added(turbulence, tmp_path, settings, added):
@@ -127,10 +127,10 @@ def test_when_it_is_added(turbulence, tmp_path, settings, added):
 
 def test_without_sigma_it_is_left_out_or_refused(turbulence, tmp_path):
     bare = turbulence.observed({}, {})
-    result = reconstruct_into(tmp_path / "r", bare, METHOD, Run(report=False))
+    result = reconstruct_into(tmp_path / "r", bare, METHOD, RunSettings(report=False))
     assert not isinstance(result.field, SumField)
     with refused("measurement"):
-        reconstruct_into(tmp_path / "q", bare, METHOD, Run(report=False, detail="on"))
+        reconstruct_into(tmp_path / "q", bare, METHOD, RunSettings(report=False, detail="on"))
     assert not (tmp_path / "q").exists()
 
 
@@ -153,4 +153,4 @@ def test_the_commands_take_a_result_with_detail(made, turbulence, tmp_path):
 def test_training_comes_first_after_a_first_run_that_explains_little(rms, blurred, most):
     scores = {"fitted_views": [{"rms": rms, "rms_measured": 1.0}]}
     job = SimpleNamespace(validation=SimpleNamespace(scores=lambda: scores))
-    assert share(job, DetailChoice(blurred=blurred)) == most
+    assert detail_share(job, DetailChoice(blurred=blurred)) == most

@@ -27,11 +27,11 @@ from nerif.report.rig_figure import image_corners
 from nerif.results.directory import CALIBRATION, FILES, MERIDIAN, REPORT, ResultDirectory
 from nerif.workflow import steps
 from nerif.workflow.pipeline import reconstruct_into
-from nerif.workflow.run_settings import Run
+from nerif.workflow.run_settings import RunSettings
 from refusals import refused
 
 QUICK = Tikhonov(voxels=8, basis="linear", iterations=4, regularisation=0.1, device="cpu")
-RUN = Run(withhold=("144deg",), report=False)
+RUN = RunSettings(withhold=("144deg",), report=False)
 
 
 @pytest.fixture(scope="module")
@@ -75,14 +75,9 @@ def test_others_may_read_the_files_as_any_new_file(made, tmp_path):
     assert modes == dict.fromkeys(modes, (tmp_path / "new").stat().st_mode)
 
 
-def test_the_command_line_takes_run_toml_and_the_model_of_a_result(made, measurement, tmp_path):
+def test_project_takes_the_model_of_a_result(made, measurement, tmp_path):
     out, path, predicted = made[0], str(tmp_path / "m.nc"), tmp_path / "p.nc"
     measurement.write(path)
-    again = ResultDirectory(tmp_path / "r")
-    assert main(["reconstruct", path, "-o", str(again.path), "--config", str(out / "run.toml"), "--no-report"]) == 0
-    points = torch.rand(20, 3)
-    assert torch.equal(again.field()[0](points), out.field()[0](points))
-    assert again.settings()["model"] == "paraxial"
     words = ["project", str(out.path), "-o", str(predicted), "--cameras", path, "--names", "72deg", "--force"]
     displacement = {}
     for model in ("", "paraxial", "lever_arm"):

@@ -28,8 +28,7 @@ __all__ = [
     "HALVES", "Reflection", "asymmetry", "asymmetry_sentence", "camera_of", "halved", "left_of_axis", "withhold_half",
 ]  # fmt: skip
 
-HALVES = ("left", "right")
-"""Halves of an image, seen in the direction of the axis."""
+HALVES = ("left", "right")  #: halves of an image, seen in the direction of the axis
 MIN_PIXELS = 30  # whose reflection was measured too
 
 

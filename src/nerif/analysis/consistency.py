@@ -79,42 +79,25 @@ GROWN, MAX_GROWN = 0.2, 0.6  # a box larger by this, over its longest edge, leav
 
 @dataclass(frozen=True)
 class ViewAgreement:
-    """How well one view agrees with the others.
+    """How well one view agrees with the others."""
 
-    Parameters
-    ----------
-    name : of the view
-    valid : share of its valid pixels
-    agreement : correlation of the measurement, corrected, with the prediction from the other views
-    gain : factor between measured and predicted values
-    verdict : the mistake, if any
-    measured : the quantity compared
-    """
-
-    name: str
-    valid: float
-    agreement: float
-    gain: float
-    verdict: str
-    measured: str = "displacement"
+    name: str  #: of the view
+    valid: float  #: share of its valid pixels
+    agreement: float  #: correlation of the measurement, corrected, with the prediction from the other views
+    gain: float  #: factor between measured and predicted values
+    verdict: str  #: the mistake, if any
+    measured: str = "displacement"  #: the quantity compared
 
 
 @dataclass(frozen=True)
 class Consistency:
-    """The outcome of a check.
+    """The outcome of a check."""
 
-    Parameters
-    ----------
-    views : agreement of every view; empty if there are too few views to compare
-    findings : mistakes, most severe first: unrelated views, then the rig, then single views
-    remarks : further notes
-    corrections : that undo the mistakes, by the name of the technique (`corrected`)
-    """
-
-    views: tuple[ViewAgreement, ...]
-    findings: tuple[Finding, ...]
-    remarks: tuple[str, ...]
+    views: tuple[ViewAgreement, ...]  #: agreement of every view; empty if there are too few views to compare
+    findings: tuple[Finding, ...]  #: mistakes, most severe first: unrelated views, then the rig, then single views
+    remarks: tuple[str, ...]  #: further notes
     corrections: Mapping[str, tuple[Correction, ...]] = field(default_factory=dict)
+    """Corrections of the mistakes, by the name of the technique (`corrected`)."""
 
 
 @on_free_cores
@@ -398,22 +381,13 @@ Transform = Callable[[Tensor], Tensor]  # of an image (row, column, channel)
 
 @dataclass(frozen=True)
 class Change:
-    """A mistake that a view may have.
+    """A mistake that a view may have."""
 
-    Parameters
-    ----------
-    code : of its Finding
-    words : its description
-    undo : the transform that undoes it
-    everywhere : its description if all views have it; empty if that cannot be detected
-    square : whether only square images can have it
-    """
-
-    code: str
-    words: str
-    undo: Transform
-    everywhere: str = ""
-    square: bool = False
+    code: str  #: of its Finding
+    words: str  #: its description
+    undo: Transform  #: the transform that undoes it
+    everywhere: str = ""  #: its description if all views have it; empty if that cannot be detected
+    square: bool = False  #: whether only square images can have it
 
 
 def _signs(u: float, v: float) -> Transform:
@@ -466,24 +440,14 @@ SIGN = Change("flipped", "the sign is flipped", lambda d: -d)
 
 @dataclass(frozen=True)
 class Correction:
-    """The correction of a mistake in some views.
+    """The correction of a mistake in some views."""
 
-    Parameters
-    ----------
-    views : indices
-    code : of its Finding
-    words : description of the mistake
-    change : transform of each of these views; None where images are exchanged
-    order : index of the image of each of these views, where images are exchanged
-    evidence : the agreement gained
-    """
-
-    views: tuple[int, ...]
-    code: str
-    words: str
-    change: Transform | None
-    order: tuple[int, ...] = ()
-    evidence: str = ""
+    views: tuple[int, ...]  #: indices
+    code: str  #: of its Finding
+    words: str  #: description of the mistake
+    change: Transform | None  #: transform of each of these views; None where images are exchanged
+    order: tuple[int, ...] = ()  #: index of the image of each of these views, where images are exchanged
+    evidence: str = ""  #: the agreement gained
 
     def undo(self, d: Tensor, cameras: Sequence[Camera]) -> Tensor:
         """Return corrected values (view, row, column, channel); each view has its own size."""

@@ -19,22 +19,13 @@ FORMAT = "nerif-check-1"
 
 @dataclass(frozen=True)
 class CheckFindings:
-    """The outcome of a check without the tensors that correct it.
+    """The outcome of a check without the tensors that correct it."""
 
-    Parameters
-    ----------
-    measurement : the file that was checked, as on the command line
-    views : agreement of every view; empty if there are too few views to compare
-    findings : faults, most severe first
-    remarks : further notes
-    correctable : whether `nerif check --out` corrects a fault
-    """
-
-    measurement: str
-    views: tuple[ViewAgreement, ...]
-    findings: tuple[Finding, ...]
-    remarks: tuple[str, ...]
-    correctable: bool
+    measurement: str  #: the file that was checked, as on the command line
+    views: tuple[ViewAgreement, ...]  #: agreement of every view; empty if there are too few views to compare
+    findings: tuple[Finding, ...]  #: faults, most severe first
+    remarks: tuple[str, ...]  #: further notes
+    correctable: bool  #: whether `nerif check --out` corrects a fault
 
     @classmethod
     def of(cls, measurement: str, result: Consistency) -> CheckFindings:

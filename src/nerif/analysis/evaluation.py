@@ -53,13 +53,10 @@ __all__ = [
 
 
 def evaluate(
-    result: str | os.PathLike[str],
-    truth: str | os.PathLike[str] | None = None,
-    measurement: str | os.PathLike[str] | None = None,
-    withhold: Sequence[str] | None = None,
-    on_view: Callable[[int, int], None] = lambda done, total: None,
-    align: str = "none",
-) -> dict[str, Any]:
+    result: str | os.PathLike[str], truth: str | os.PathLike[str] | None = None,
+    measurement: str | os.PathLike[str] | None = None, withhold: Sequence[str] | None = None,
+    on_view: Callable[[int, int], None] = lambda done, total: None, align: str = "none",
+) -> dict[str, Any]:  # fmt: skip
     """Compare a result directory with a truth or with measured views; return the metrics and add them to it.
 
     Views whose gains were fitted with the field are divided by these gains.

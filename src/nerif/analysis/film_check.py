@@ -59,7 +59,7 @@ MIN_COUNT, MAX_CORRELATION = 8, 0.999  # of a band
 
 
 @runtime_checkable
-class Film(Protocol):
+class FrameSource(Protocol):
     """What the check needs of a film, such as a MeasurementSequence."""
 
     @property
@@ -80,7 +80,7 @@ class Excerpt:
     aperture : depth of field, as in NeRIF
     """
 
-    def __init__(self, film: Film, aperture: str = "auto") -> None:
+    def __init__(self, film: FrameSource, aperture: str = "auto") -> None:
         self.film, self.aperture = film, aperture
         self.names = self.measurement(film.fullest()).names
         self._frames: dict[int, Measurement | None] = {}
@@ -167,14 +167,9 @@ def band_evidence(
 
 @dataclass(frozen=True)
 class Evidence:
-    """Evidence of one view for each shift of its film.
+    """Evidence of one view for each shift of its film."""
 
-    Parameters
-    ----------
-    by_shift : in frames; 0 is in it
-    """
-
-    by_shift: Mapping[int, float]
+    by_shift: Mapping[int, float]  #: in frames; 0 is in it
 
     @property
     def best(self) -> int:
@@ -240,22 +235,13 @@ def _of_shifts(
 
 @dataclass(frozen=True)
 class Shift:
-    """The shift of a view's film: its frame i + frames shows what most others show in frame i.
+    """The shift of a view's film: its frame i + frames shows what most others show in frame i."""
 
-    Parameters
-    ----------
-    name : of the view
-    frames : positive if the film is late
-    gain : of evidence, over no shift
-    sharp : whether every other shift would fit clearly worse
-    at_end : whether the film is too short for a larger shift
-    """
-
-    name: str
-    frames: int
-    gain: float
-    sharp: bool
-    at_end: bool = False
+    name: str  #: of the view
+    frames: int  #: positive if the film is late
+    gain: float  #: of evidence, over no shift
+    sharp: bool  #: whether every other shift would fit clearly worse
+    at_end: bool = False  #: whether the film is too short for a larger shift
 
     @property
     def clear(self) -> bool:
@@ -347,7 +333,7 @@ def _words(late: int) -> str:
 
 @on_free_cores
 def check_film(
-    film: Film, voxels: int = 24, on_step: Callable[[int, int], None] = lambda done, total: None,
+    film: FrameSource, voxels: int = 24, on_step: Callable[[int, int], None] = lambda done, total: None,
     aperture: str = "auto",
 ) -> Consistency:  # fmt: skip
     """Find views whose films are late or early, and compare the views of one instant with each other.

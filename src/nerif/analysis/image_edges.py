@@ -37,18 +37,11 @@ REMEDY = (
 
 @dataclass(frozen=True)
 class CutEdge:
-    """An edge of an image at which the flow is cut off.
+    """An edge of an image at which the flow is cut off."""
 
-    Parameters
-    ----------
-    view : index
-    side : left, right, top, bottom
-    signal : rms along it over that of the image
-    """
-
-    view: int
-    side: str
-    signal: float
+    view: int  #: index
+    side: str  #: left, right, top, bottom
+    signal: float  #: rms along it over that of the image
 
 
 def _share_of_box(measurement: Measurement) -> float:

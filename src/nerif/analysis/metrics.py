@@ -14,8 +14,7 @@ __all__ = [
 
 Array = np.ndarray
 
-LEVELS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)
-"""Confidence levels of a reliability diagram."""
+LEVELS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)  #: confidence levels of a reliability diagram
 NAN = float("nan")
 
 

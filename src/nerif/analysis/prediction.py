@@ -47,8 +47,7 @@ MAX_THIN_RAYS = 1 << 21  # per call of the voxel operator
 Splines = (VoxelField, SymmetricVoxels)
 __all__ = ["TRACED", "SampledViews", "check_sees", "evaluations", "predict", "predict_view", "reproject"]
 
-TRACED = "traced"
-"""Name of the deflection model that traces rays through the field, to all orders."""
+TRACED = "traced"  #: name of the deflection model that traces rays through the field, to all orders
 
 
 def check_sees(techniques: Sequence[type[ForwardModel]], quantity: str, what: str) -> None:
@@ -98,17 +97,10 @@ def _through_voxels(
 
 @on_free_cores
 def predict(
-    field: Field,
-    cameras: Sequence[Camera],
-    box: Box,
-    n_ambient: float,
-    model: str = AUTO,
-    samples: int = 200,
-    on_view: Callable[[int, int], None] = lambda done, total: None,
-    technique: type[ForwardModel] = ASSUMED,
-    wavelength_nm: float | None = None,
-    quantity: str | None = None,
-) -> Measurement:
+    field: Field, cameras: Sequence[Camera], box: Box, n_ambient: float, model: str = AUTO, samples: int = 200,
+    on_view: Callable[[int, int], None] = lambda done, total: None, technique: type[ForwardModel] = ASSUMED,
+    wavelength_nm: float | None = None, quantity: str | None = None,
+) -> Measurement:  # fmt: skip
     """Return the measurement of a field by cameras, without noise.
 
     Parameters
@@ -143,13 +135,9 @@ def predict(
 
 @on_free_cores
 def reproject(
-    field: Field,
-    measurement: Measurement,
-    withheld: Collection[str] = (),
-    device: torch.device | str = "cpu",
-    on_view: Callable[[int, int], None] = lambda done, total: None,
-    model: str = AUTO,
-) -> Reprojection:
+    field: Field, measurement: Measurement, withheld: Collection[str] = (), device: torch.device | str = "cpu",
+    on_view: Callable[[int, int], None] = lambda done, total: None, model: str = AUTO,
+) -> Reprojection:  # fmt: skip
     """Predict every view of a measurement from a field, for each of its techniques.
 
     The path integral through a network is computed on every pixel if that takes some seconds. For larger images the
@@ -262,21 +250,13 @@ class SampledViews:
     A lattice of rays, RAYS_PER_VOXEL, is integrated through the spline by the compiled operator, with bicubic
     interpolation between its pixels. The effect of bending (`curved`) is integrated through the network on a coarser
     lattice.
-
-    Parameters
-    ----------
-    field : the network, or its sum with splines
-    splines : through the values of the network (`on_voxels`), and those that are added to it
-    box : where the rays are integrated, mm
-    projector : the path integral through the field
-    device : of the network
     """
 
-    field: Field
-    splines: tuple[Field, ...]
-    box: Box
-    projector: PathIntegral
-    device: torch.device | str = "cpu"
+    field: Field  #: the network, or its sum with splines
+    splines: tuple[Field, ...]  #: through the values of the network (`on_voxels`), and those that are added to it
+    box: Box  #: where the rays are integrated, mm
+    projector: PathIntegral  #: the path integral through the field
+    device: torch.device | str = "cpu"  #: of the network
 
     def __call__(self, camera: Camera) -> Float[Tensor, "row column c"]:
         """Return the view of a camera; undefined where a ray misses the box."""

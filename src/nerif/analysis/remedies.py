@@ -22,18 +22,11 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Remedy:
-    """A remedy.
+    """A remedy."""
 
-    Parameters
-    ----------
-    words : with the option
-    setting : of run.toml by which it is in use; empty for another command
-    values : with any of which it is
-    """
-
-    words: str
-    setting: str = ""
-    values: tuple[str, ...] = ()
+    words: str  #: with the option
+    setting: str = ""  #: of run.toml by which it is in use; empty for another command
+    values: tuple[str, ...] = ()  #: with any of which it is
 
     def in_use(self, settings: Mapping[str, Any]) -> bool:
         """Whether a run with these settings has it in use."""

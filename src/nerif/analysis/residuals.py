@@ -35,22 +35,13 @@ MIN_ROWS = 0.5  # of it, that the movement of rows has to explain: they have mor
 
 @dataclass(frozen=True)
 class Whiteness:
-    """Outcome of the test of a residual.
+    """Outcome of the test of a residual."""
 
-    Parameters
-    ----------
-    grain : 1 for white noise, larger for correlated residuals
-    white : whether it is compatible with white noise
-    cause : one of remedies.CAUSES, or empty
-    share : of the correlated part that the cause explains
-    row, column : position of the largest block, px
-    """
-
-    grain: float
-    white: bool
-    cause: str
-    share: float
-    row: float
+    grain: float  #: 1 for white noise, larger for correlated residuals
+    white: bool  #: whether it is compatible with white noise
+    cause: str  #: one of remedies.CAUSES, or empty
+    share: float  #: of the correlated part that the cause explains
+    row: float  #: of the largest block, px
     column: float
 
     @property

@@ -24,18 +24,12 @@ MAX_RESIDUAL = 2.0  # sigma, above which the field is too inaccurate to judge th
 
 @dataclass(frozen=True)
 class RigCheck:
-    """The refined rig, and what it shows of the calibration.
-
-    Parameters
-    ----------
-    table : for each view its corrections, their standard deviations before and after, and its residual
-    remarks : further notes
-    findings : impossible camera poses, and significant pose errors
-    """
+    """The refined rig, and what it shows of the calibration."""
 
     table: list[RefinedView]
-    remarks: tuple[str, ...]
-    findings: tuple[Finding, ...]
+    """For each view its corrections, their standard deviations before and after, and its residual."""
+    remarks: tuple[str, ...]  #: further notes
+    findings: tuple[Finding, ...]  #: impossible camera poses, and significant pose errors
 
 
 @on_free_cores

@@ -71,19 +71,12 @@ WHITE = ResidualTest(grain=1.0, white=True, cause="", share=0.0, row=0.0, column
 
 @dataclass(frozen=True)
 class Estimate:
-    """The relative error of the variation of a field.
+    """The relative error of the variation of a field."""
 
-    Parameters
-    ----------
-    error : estimate
-    low, high : range that holds in nine of ten cases like those of the benchmark
-    basis : what it was estimated from
-    """
-
-    error: float
-    low: float
+    error: float  #: estimate
+    low: float  #: end of the range that holds in nine of ten cases like those of the benchmark
     high: float
-    basis: str
+    basis: str  #: what it was estimated from
 
     @classmethod
     def within(cls, error: float, factor: float, basis: str) -> Estimate:
@@ -102,20 +95,12 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Verdict:
-    """Whether a result can be used.
+    """Whether a result can be used."""
 
-    Parameters
-    ----------
-    rating : one of RATINGS
-    error : estimated relative error of the variation, or None
-    reasons : for it
-    low, high : range of the error, or None
-    """
-
-    rating: str
-    error: float | None
-    reasons: str
-    low: float | None = None
+    rating: str  #: one of RATINGS
+    error: float | None  #: estimated relative error of the variation, or None
+    reasons: str  #: for it
+    low: float | None = None  #: end of the range of the error
     high: float | None = None
 
     @classmethod

@@ -28,8 +28,7 @@ __all__ = [
     "orientations",
 ]  # fmt: skip
 
-UNITS = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4}
-"""Lengths of models in files, mm."""
+UNITS = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4}  #: lengths of models in files, mm
 LENS_RAYS = 16  # per pixel with a lens or a window
 RAYS_AT_A_TIME = 1 << 16
 MANY = 512  # points, for which several threads are worth while
@@ -42,23 +41,11 @@ TINY, LARGE = 0.01, 20.0  # of the box, beyond which the size of a body is not m
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """A closed mesh of triangles, which light does not pass.
+    """A closed mesh of triangles, which light does not pass; InputError for one that is open, inside out or flat."""
 
-    Parameters
-    ----------
-    vertices : (n, 3) corners of the triangles, mm, world frame
-    faces : (m, 3) vertices of each triangle, counter-clockwise as seen from outside; turned if they all face inwards
-    name : in messages
-
-    Raises
-    ------
-    InputError
-        If the mesh is not closed, its triangles face different sides, or it has no volume.
-    """
-
-    vertices: Float[Tensor, "n 3"]
-    faces: Int[Tensor, "m 3"]
-    name: str = "body"
+    vertices: Float[Tensor, "n 3"]  #: corners of the triangles, mm, world frame
+    faces: Int[Tensor, "m 3"]  #: vertices of each, counter-clockwise as seen from outside; turned if all face inwards
+    name: str = "body"  #: in messages
 
     def __post_init__(self) -> None:
         def check(valid: bool, expected: str, got: object) -> None:
@@ -164,10 +151,8 @@ class Body:
         from nerif.geometry.mesh_kernel import closest
 
         flat = points.detach().reshape(-1, 3).cpu().double().contiguous()
-        where, _, face = closest(self._tree, flat.numpy())
-        return torch.from_numpy(where).reshape(points.shape).to(points), torch.from_numpy(face).reshape(
-            points.shape[:-1]
-        ).to(points.device)
+        where, _, face = (torch.from_numpy(part) for part in closest(self._tree, flat.numpy(), np.inf))
+        return where.reshape(points.shape).to(points), face.reshape(points.shape[:-1]).to(points.device)
 
     def distance(self, points: Points) -> Values:
         """Return the distances of points (mm) from the surface, mm, below 0 inside."""

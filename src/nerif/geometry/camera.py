@@ -42,35 +42,23 @@ class Plane:
 
 @dataclass(frozen=True)
 class Camera:
-    """A calibrated camera and the background it looks at.
+    """A calibrated camera and the background it looks at."""
 
-    Parameters
-    ----------
-    intrinsics : (3, 3) K, px; fx and fy of a telecentric camera in px/mm
-    rotation : (3, 3) world to camera
-    translation : (3,) world to camera, mm
-    image_size : (height, width), px
-    background : Plane of any orientation, world frame, mm; None for a technique without one
-    distortion : (5,) OpenCV's k1, k2, p1, p2, k3; of a telecentric camera for (x, y) in mm
-    name : of the view
-    lens : the aperture through which a pixel sees; None for one thin ray per pixel
-    pose_sigma : (6,) standard deviations of the rotation about its own axes (rad) and of the shift of its centre along
-        them (mm), or None
-    tilt : (2,) OpenCV's tau_x, tau_y of the sensor behind a Scheimpflug lens, rad; of a perspective camera only, since
-        for parallel rays fx, fy and skew describe it
-    """
-
-    intrinsics: Matrix3
-    rotation: Matrix3
-    translation: Float[Tensor, 3]
-    image_size: tuple[int, int]
-    background: Plane | None
-    distortion: Float[Tensor, 5]
-    name: str = "camera"
+    intrinsics: Matrix3  #: K, px; fx and fy of a telecentric camera in px/mm
+    rotation: Matrix3  #: world to camera
+    translation: Float[Tensor, 3]  #: world to camera, mm
+    image_size: tuple[int, int]  #: (height, width), px
+    background: Plane | None  #: of any orientation, world frame, mm; None for a technique without one
+    distortion: Float[Tensor, 5]  #: OpenCV's k1, k2, p1, p2, k3; of a telecentric camera for (x, y) in mm
+    name: str = "camera"  #: of the view
     projection: Projection = PERSPECTIVE
-    lens: Lens | None = None
+    lens: Lens | None = None  #: the aperture through which a pixel sees; None for one thin ray per pixel
     pose_sigma: Float[Tensor, 6] | None = None
+    """Standard deviations of the rotation about its own axes (rad) and of the shift of its centre along them
+    (mm), or None."""
     tilt: Float[Tensor, 2] = UPRIGHT
+    """OpenCV's tau_x, tau_y of the sensor behind a Scheimpflug lens, rad; of a perspective camera only, since
+    for parallel rays fx, fy and skew describe it."""
 
     def __post_init__(self) -> None:
         def check(name: str, valid: bool, expected: str, got: object, remedy: str = "") -> None:

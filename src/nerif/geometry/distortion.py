@@ -32,10 +32,8 @@ __all__ = [
     "undistort",
 ]  # fmt: skip
 
-POWERS = (2, 4, 1, 1, 6)
-"""Units of k1, k2, p1, p2, k3: inverse powers of that of (x, y)."""
-UPRIGHT = torch.zeros(2, dtype=torch.float64)
-"""Tilt of a sensor across the optical axis."""
+POWERS = (2, 4, 1, 1, 6)  #: units of k1, k2, p1, p2, k3: inverse powers of that of (x, y)
+UPRIGHT = torch.zeros(2, dtype=torch.float64)  #: tilt of a sensor across the optical axis
 MAX_IMAGINARY = 1e-6  # part of a real root, over its absolute value
 MAX_START, MAX_STEP = 0.9, 0.25  # of Newton's method, over the radius of the fold
 

@@ -58,22 +58,16 @@ PLASTIC = 1.324717957244746  # root of x^3 = x + 1, which gives the most even la
 
 @dataclass(frozen=True)
 class Lens:
-    """The aperture and window of a pixel: a thin lens, and the square of pixels over which a displacement is the mean.
-
-    Parameters
-    ----------
-    diameter : of the entrance pupil (focal length / f-number) or, of a telecentric lens, of the cone of rays to a point
-        in focus at z_cam = 0; mm; 0 for thin rays
-    focus : depth of the plane in focus along the optical axis, mm, negative only for a telecentric lens; None: the
-        background
-    points : number of points on the disc for rendered images and simulated measurements
-    window : edge of the square, px; 0 for a displacement at the pixel
-    """
+    """Aperture and window of a pixel: a thin lens, and the square of pixels over which a displacement is the mean."""
 
     diameter: float = 0.0
+    """Diameter, mm, of the entrance pupil (focal length / f-number) or, of a telecentric lens, of the cone of rays to a
+    point in focus at z_cam = 0; 0 for thin rays."""
     focus: float | None = None
-    points: Count = 19
-    window: Annotated[float, Ge(0), Le(MAX_WINDOW)] = 0.0
+    """Depth of the plane in focus along the optical axis, mm, negative only for a telecentric lens; None: the
+    background."""
+    points: Count = 19  #: number of points on the disc for rendered images and simulated measurements
+    window: Annotated[float, Ge(0), Le(MAX_WINDOW)] = 0.0  #: edge of the square, px; 0 for a displacement at the pixel
 
     def __post_init__(self) -> None:
         check_settings(self)
@@ -99,26 +93,15 @@ class Lens:
 
 @dataclass(frozen=True)
 class LensDiscs(Columns):
-    """The disc of the lens about each ray, and the window about its pixel.
+    """The disc of the lens about each ray, and the window about its pixel."""
 
-    Parameters
-    ----------
-    axis : (n, 3) unit vector of the optical axis, normal to the disc
-    normal : (n, 3) unit normal of the background; the axis without one
-    radius : (n,) mm
-    focus : (n,) path length from the ray's origin to the point in focus, mm
-    window : (n,) half the edge of the window, px
-    parallel : (n,) whether rays of other pixels are parallel to this one, or have the same origin
-    box : to which rays through other points of the disc are clipped, or None
-    """
-
-    axis: Float[Tensor, "n 3"]
-    normal: Float[Tensor, "n 3"]
-    radius: Float[Tensor, " n"]
-    focus: Float[Tensor, " n"]
-    window: Float[Tensor, " n"]
-    parallel: Bool[Tensor, " n"]
-    box: Box | None = None
+    axis: Float[Tensor, "n 3"]  #: unit vector of the optical axis, normal to the disc
+    normal: Float[Tensor, "n 3"]  #: unit normal of the background; the axis without one
+    radius: Float[Tensor, " n"]  #: mm
+    focus: Float[Tensor, " n"]  #: path length from the ray's origin to the point in focus, mm
+    window: Float[Tensor, " n"]  #: half the edge of the window, px
+    parallel: Bool[Tensor, " n"]  #: whether rays of other pixels are parallel to this one, or have the same origin
+    box: Box | None = None  #: to which rays through other points of the disc are clipped, or None
 
     def shifts(
         self, square: Float[Tensor, "n k 2"], sensitivity: Float[Tensor, "n 2 3"], direction: Float[Tensor, "n 3"]

@@ -21,6 +21,7 @@ LEAF = 4  # triangles, about
 BITS = 16  # of the Morton code along each axis
 SLACK = 1e-9  # of the size of the mesh, by which boxes are larger, and of a triangle, by which rays hit its edges
 DEPTH = 64  # of the stack: the tree of 2^63 leaves
+OBLIQUE = np.array([0.5377667, 0.3188765, 0.7804541])  # direction in which no edge of a drawn model lies
 
 
 class Tree(NamedTuple):
@@ -61,33 +62,6 @@ def _morton(places: Int[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
     return code
 
 
-def first_hits(
-    tree: Tree, origin: Float[np.ndarray, "n 3"], direction: Float[np.ndarray, "n 3"],
-    begin: Float[np.ndarray, " n"], end: Float[np.ndarray, " n"],
-) -> Float[np.ndarray, " n"]:  # fmt: skip
-    """Return the path lengths at which rays first meet a triangle between begin and end; infinity without one."""
-    return _first_hits(tree.boxes, tree.begin, tree.corners, origin, direction, begin, end)
-
-
-def windings(tree: Tree, points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
-    """Return how often the mesh encloses points: ways out less ways in along a half-line."""
-    return _windings(tree.boxes, tree.begin, tree.corners, points, OBLIQUE)
-
-
-def closest(
-    tree: Tree, points: Float[np.ndarray, "n 3"], reach: float = np.inf
-) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"], Int[np.ndarray, " n"]]:
-    """Return the points of the mesh that are closest to points, if they are within reach (NaN: they are not).
-
-    With them go their barycentric coordinates and their triangles.
-    """
-    where, weights, face = _closest(tree.boxes, tree.begin, tree.corners, points, reach)
-    return where, weights, tree.order[face]
-
-
-OBLIQUE = np.array([0.5377667, 0.3188765, 0.7804541])  # direction in which no edge of a drawn model lies
-
-
 @njit(nogil=True)
 def _into(boxes, node, origin, inverse, begin, end):
     """Path length at which a ray enters a box between begin and end; infinity if it misses it."""
@@ -124,8 +98,10 @@ def _inverse(direction):
     return inverse
 
 
-@njit(nogil=True)
-def _first_hits(boxes, begins, corners, origin, direction, begin, end):
+@njit(nogil=True, cache=True)
+def first_hits(tree, origin, direction, begin, end):
+    """Return the path lengths at which rays first meet a triangle between begin and end; infinity without one."""
+    boxes, begins, corners = tree.boxes, tree.begin, tree.corners
     result, stack, inner = np.full(len(origin), np.inf), np.empty(DEPTH, np.int64), len(begins) - 2
     for i in range(len(origin)):
         inverse, nearest = _inverse(direction[i]), end[i]
@@ -146,10 +122,12 @@ def _first_hits(boxes, begins, corners, origin, direction, begin, end):
     return result
 
 
-@njit(nogil=True)
-def _windings(boxes, begins, corners, points, direction):
+@njit(nogil=True, cache=True)
+def windings(tree, points):
+    """Return how often the mesh encloses points: ways out less ways in along a half-line."""
+    boxes, begins, corners = tree.boxes, tree.begin, tree.corners
     result, stack, inner = np.zeros(len(points), np.int64), np.empty(DEPTH, np.int64), len(begins) - 2
-    inverse = _inverse(direction)
+    inverse = _inverse(OBLIQUE)
     for i in range(len(points)):
         stack[0], count = 0, 1
         while count:
@@ -162,7 +140,7 @@ def _windings(boxes, begins, corners, points, direction):
                 count += 2
                 continue
             for k in range(begins[node - inner], begins[node - inner + 1]):
-                s, determinant = _meets(corners[k], points[i], direction, 0.0)
+                s, determinant = _meets(corners[k], points[i], OBLIQUE, 0.0)
                 if 0.0 <= s < np.inf:
                     result[i] += 1 if determinant < 0.0 else -1
     return result
@@ -207,9 +185,14 @@ def _weights(corner, point):
     return vb / (va + vb + vc), vc / (va + vb + vc)
 
 
-@njit(nogil=True)
-def _closest(boxes, begins, corners, points, reach):
-    where, face, on = np.full((len(points), 3), np.nan), np.zeros(len(points), np.int64), np.empty(3)
+@njit(nogil=True, cache=True)
+def closest(tree, points, reach):
+    """Return the points of the mesh that are closest to points, if they are within reach (NaN: they are not).
+
+    With them go their barycentric coordinates and their triangles.
+    """
+    boxes, begins, corners = tree.boxes, tree.begin, tree.corners
+    where, face, on = np.full((len(points), 3), np.nan), np.full(len(points), tree.order[0]), np.empty(3)
     weights = np.full((len(points), 3), np.nan)
     stack, inner = np.empty(DEPTH, np.int64), len(begins) - 2
     for i in range(len(points)):
@@ -234,7 +217,7 @@ def _closest(boxes, begins, corners, points, reach):
                     on[a] = (1.0 - v - w) * corners[k, 0, a] + v * corners[k, 1, a] + w * corners[k, 2, a]
                     squared += (on[a] - points[i, a]) ** 2
                 if squared < best:
-                    best, face[i] = squared, k
+                    best, face[i] = squared, tree.order[k]
                     where[i] = on
                     weights[i, 0], weights[i, 1], weights[i, 2] = 1.0 - v - w, v, w
     return where, weights, face

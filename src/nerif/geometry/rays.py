@@ -25,43 +25,25 @@ __all__ = ["BackgroundPoints", "Rays"]
 
 @dataclass(frozen=True)
 class BackgroundPoints(Columns):
-    """Ends of rays on a background, and the sensitivity of the image to shifts there.
+    """Ends of rays on a background, and the sensitivity of the image to shifts there."""
 
-    Parameters
-    ----------
-    sensitivity : (n, 2, 3) S = -d project / d X at the background point, px/mm; S . direction = 0
-    distance : (n,) path length s_b from the ray's origin to the background, mm
-    """
-
-    sensitivity: Float[Tensor, "n 2 3"]
-    distance: Float[Tensor, " n"]
+    sensitivity: Float[Tensor, "n 2 3"]  #: S = -d project / d X at the background point, px/mm; S . direction = 0
+    distance: Float[Tensor, " n"]  #: path length s_b from the ray's origin to the background, mm
 
 
 @dataclass(frozen=True)
 class Rays(Columns):
-    """Back-traced rays, in the world frame.
+    """Back-traced rays, in the world frame."""
 
-    Parameters
-    ----------
-    origin : (n, 3) camera centre, mm; of a telecentric camera the ray's point on the plane z_cam = 0
-    direction : (n, 3) unit vector, away from the camera
-    near, far : (n,) path lengths between which the ray is inside the box, mm; far <= near for a ray that misses it
-    pixel : (n, 2) column and row, px
-    view : (n,) index of the view
-    begin : (n,) path length at which the ray begins, mm: 0, or -inf for a telecentric camera
-    background : its ends on the background, or None
-    lens : the lens about each ray, and the window of its pixel; None for thin rays
-    """
-
-    origin: Float[Tensor, "n 3"]
-    direction: Float[Tensor, "n 3"]
-    near: Float[Tensor, " n"]
-    far: Float[Tensor, " n"]
-    pixel: Float[Tensor, "n 2"]
-    view: Int16[Tensor, " n"]
-    begin: Float[Tensor, " n"]
-    background: BackgroundPoints | None = None
-    lens: LensDiscs | None = None
+    origin: Float[Tensor, "n 3"]  #: camera centre, mm; of a telecentric camera the ray's point on the plane z_cam = 0
+    direction: Float[Tensor, "n 3"]  #: unit vector, away from the camera
+    near: Float[Tensor, " n"]  #: path length at which the ray enters the box, mm
+    far: Float[Tensor, " n"]  #: at which it leaves the box; far <= near for a ray that misses it
+    pixel: Float[Tensor, "n 2"]  #: column and row, px
+    view: Int16[Tensor, " n"]  #: index of the view
+    begin: Float[Tensor, " n"]  #: path length at which the ray begins, mm: 0, or -inf for a telecentric camera
+    background: BackgroundPoints | None = None  #: its ends on the background, or None
+    lens: LensDiscs | None = None  #: the lens about each ray, and the window of its pixel; None for thin rays
 
     def __len__(self) -> int:
         return self.origin.shape[0]

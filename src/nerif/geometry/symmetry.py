@@ -39,22 +39,14 @@ NAMES = ("shift_1", "shift_2", "lean_1", "lean_2")
 
 @dataclass(frozen=True)
 class Symmetry:
-    """A symmetry of a field.
+    """A symmetry of a field."""
 
-    Parameters
-    ----------
-    kind : axis, or planar
-    point : p, mm, on the axis; of a planar field any
-    frame : (e1, e2, e3), orthonormal; e3 along the axis, or e2 along the direction in which the field is constant
-    rounding : d, mm, at least a millionth of the size of the field
-    harmonics : N, of the azimuth
-    """
-
-    kind: str
-    point: tuple[float, float, float]
+    kind: str  #: axis, or planar
+    point: tuple[float, float, float]  #: p, mm, on the axis; of a planar field any
     frame: tuple[tuple[float, float, float], ...]
-    rounding: float
-    harmonics: int = 0
+    """(e1, e2, e3), orthonormal; e3 along the axis, or e2 along the direction in which the field is constant."""
+    rounding: float  #: d, mm, at least a millionth of the size of the field
+    harmonics: int = 0  #: N, of the azimuth
 
     @classmethod
     def about(
@@ -230,20 +222,14 @@ class Symmetry:
 
 @dataclass(frozen=True)
 class Axis:
-    """A refined axis of symmetry.
-
-    Parameters
-    ----------
-    values : of NAMES, relative to the initial axis
-    prior_sigma, posterior_sigma : their standard deviations; prior 0 for a parameter that was not refined
-    residual : rms over sigma of a coarse reconstruction (over the rms of the data, if sigma is unknown)
-    """
+    """A refined axis of symmetry."""
 
     symmetry: Symmetry
-    values: tuple[float, ...]
+    values: tuple[float, ...]  #: of NAMES, relative to the initial axis
     prior_sigma: tuple[float, ...]
-    posterior_sigma: tuple[float, ...]
-    residual: float
+    """Standard deviations of the values before the refinement; 0 for a parameter that was not refined."""
+    posterior_sigma: tuple[float, ...]  #: the same after it
+    residual: float  #: rms over sigma of a coarse reconstruction (over the rms of the data, if sigma is unknown)
 
     @property
     def constrained(self) -> tuple[bool, ...]:

@@ -73,7 +73,7 @@ def tigre_of(
         if not distance > 0:
             raise InputError("expected a camera outside the middle of the box", field=f"view '{camera.name}'")
         alpha, theta = math.atan2(source[1], source[0]), -math.atan2(source[2], math.hypot(source[0], source[1]))
-        frame = _z(alpha) @ _y(theta)
+        frame = _turn("z", alpha) @ _turn("y", theta)
         x, y, z = (frame.T @ middle).tolist()
         u, v = row[6:9] / width, row[9:] / height
         turn = frame.T @ torch.stack([torch.linalg.cross(u, v), u, v], dim=1)
@@ -152,8 +152,9 @@ def from_tigre(geometry: Mapping[str, Any]) -> tuple[Float[Tensor, "view 12"], t
             )
     vectors = []
     for i, (alpha, theta, psi) in enumerate(angles.tolist()):
-        frame = _z(alpha) @ _y(theta) @ _z(psi)
-        turn = frame @ _z(float(turns[i, 2])) @ _y(float(turns[i, 1])) @ _x(float(turns[i, 0]))
+        frame = _turn("z", alpha) @ _turn("y", theta) @ _turn("z", psi)
+        x, y, z = turns[i].tolist()
+        turn = frame @ _turn("z", z) @ _turn("y", y) @ _turn("x", x)
         middle = torch.stack([source[i, 0] - detector[i, 0], off[i, 1], off[i, 0]])
         from_origin = frame[:, 0] * source[i, 0]
         parts = [origin[i] + from_origin, origin[i] + frame @ middle, du * turn[:, 1], dv * turn[:, 2]]
@@ -161,19 +162,13 @@ def from_tigre(geometry: Mapping[str, Any]) -> tuple[Float[Tensor, "view 12"], t
     return torch.stack(vectors), (whole(rows, "nDetector"), whole(columns, "nDetector"))
 
 
-def _x(angle: float) -> Matrix3:
-    c, s = math.cos(angle), math.sin(angle)
-    return torch.tensor([[1, 0, 0], [0, c, -s], [0, s, c]], dtype=torch.float64)
-
-
-def _y(angle: float) -> Matrix3:
-    c, s = math.cos(angle), math.sin(angle)
-    return torch.tensor([[c, 0, s], [0, 1, 0], [-s, 0, c]], dtype=torch.float64)
-
-
-def _z(angle: float) -> Matrix3:
-    c, s = math.cos(angle), math.sin(angle)
-    return torch.tensor([[c, -s, 0], [s, c, 0], [0, 0, 1]], dtype=torch.float64)
+def _turn(axis: str, angle: float) -> Matrix3:
+    """Rotation about an axis by an angle, rad."""
+    i, j = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[axis]
+    matrix = torch.eye(3, dtype=torch.float64)
+    matrix[i, i] = matrix[j, j] = math.cos(angle)
+    matrix[i, j], matrix[j, i] = -math.sin(angle), math.sin(angle)
+    return matrix
 
 
 def _angles(turn: Matrix3) -> tuple[float, float, float]:

@@ -49,24 +49,15 @@ def _power_series(*coefficients: float) -> Callable[[float], float]:
 
 @dataclass(frozen=True)
 class Gas:
-    """A gas and its dispersion formula.
-
-    Parameters
-    ----------
-    molar_mass : kg/mol
-    temperature, pressure : K, Pa; reference state of the formula
-    refractivity : n - 1 at the reference state by the vacuum wavelength in um
-    wavelength_range : nm, in which the formula was fitted
-    source : of the formula
-    """
+    """A gas and its dispersion formula."""
 
     name: str
-    molar_mass: float
-    temperature: float
-    pressure: float
-    refractivity: Callable[[float], float]
-    wavelength_range: tuple[float, float]
-    source: str
+    molar_mass: float  #: kg/mol
+    temperature: float  #: K, of the reference state of the formula
+    pressure: float  #: Pa, of the same
+    refractivity: Callable[[float], float]  #: n - 1 at the reference state by the vacuum wavelength in um
+    wavelength_range: tuple[float, float]  #: nm, in which the formula was fitted
+    source: str  #: of the formula
 
 
 GASES: Mapping[str, Gas] = {

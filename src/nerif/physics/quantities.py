@@ -28,8 +28,7 @@ if TYPE_CHECKING:
 
 __all__ = ["NOT_UNIFORM", "GasChanges", "GasSettings", "derive", "derive_all", "deviation", "masked_lines"]
 
-TEMPERATURE_RANGE = 200.0, 4000.0
-"""K; outside, gases of the table condense or dissociate."""
+TEMPERATURE_RANGE = 200.0, 4000.0  #: K; outside, gases of the table condense or dissociate
 LEAST_PRESSURE, LEAST_WAVELENGTH = 100.0, 100.0  # Pa and nm; smaller ones are in bar and µm
 AMBIENT_RANGE = 200.0, 2000.0  # K, of the gas around a flow
 HOTTEST = 2300.0  # K, of flames in air; helium in air appears as air of 2400 K

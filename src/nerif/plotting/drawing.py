@@ -20,25 +20,10 @@ if TYPE_CHECKING:
     from nerif.geometry import Grid
 
 __all__ = [
-    "COLOURS",
-    "COLOUR_MAPS",
-    "DIVERGING",
-    "LABELS",
-    "SEQUENTIAL",
-    "Drawable",
-    "add_colour_bar",
-    "colour_range",
-    "draw_map",
-    "draw_slice",
-    "draw_slices",
-    "label_of",
-    "map_colours",
-    "map_range",
-    "plain",
-    "plotted_quantities",
-    "plotted_values",
-    "style",
-]
+    "COLOURS", "COLOUR_MAPS", "DIVERGING", "LABELS", "SEQUENTIAL", "Drawable", "add_colour_bar", "colour_range",
+    "draw_map", "draw_slice", "draw_slices", "label_of", "map_colours", "map_range", "plain", "plotted_quantities",
+    "plotted_values", "style",
+]  # fmt: skip
 
 
 class Drawable(Protocol):
@@ -52,13 +37,11 @@ class Drawable(Protocol):
     def quantity(self) -> str: ...
 
 
-PLANES = {"z": ("x", "y"), "y": ("x", "z"), "x": ("y", "z")}
-"""Normal of a slice, and its horizontal and vertical axis."""
+PLANES = {"z": ("x", "y"), "y": ("x", "z"), "x": ("y", "z")}  #: normal of a slice, and its horizontal and vertical axis
 
 SEQUENTIAL, DIVERGING = "viridis", "RdBu_r"
 
-COLOUR_MAPS = {"temperature": "inferno", "emission": "magma"}
-"""By quantity; SEQUENTIAL for the others."""
+COLOUR_MAPS = {"temperature": "inferno", "emission": "magma"}  #: by quantity; SEQUENTIAL for the others
 
 COLOURS = {"blue": "#0072B2", "orange": "#D55E00", "green": "#009E73", "grey": "#595959"}  # Okabe & Ito
 
@@ -137,16 +120,10 @@ def draw_slice(
     i, j = "xyz".index(across), "xyz".index(up)
     axes.set_facecolor("0.8")
     axes.imshow(
-        plane,
-        origin="lower",
-        extent=(box.lower[i], box.upper[i], box.lower[j], box.upper[j]),
-        vmin=low,
-        vmax=high,
-        cmap=colour_map or COLOUR_MAPS.get(volume.quantity.partition("_")[0], SEQUENTIAL),
-        interpolation="nearest",
-    )
-    axes.set_xlabel(f"{across} [mm]")
-    axes.set_ylabel(f"{up} [mm]")
+        plane, origin="lower", extent=(box.lower[i], box.upper[i], box.lower[j], box.upper[j]), vmin=low, vmax=high,
+        cmap=colour_map or COLOUR_MAPS.get(volume.quantity.partition("_")[0], SEQUENTIAL), interpolation="nearest",
+    )  # fmt: skip
+    axes.set(xlabel=f"{across} [mm]", ylabel=f"{up} [mm]")
     return axes
 
 
@@ -208,8 +185,7 @@ def draw_map(axes: Axes, image: np.ndarray, limits: tuple[float, float]) -> Axes
     """Draw a map of one view in a colour range (map_range); rows downward, NaN grey."""
     axes.set_facecolor("0.8")
     axes.imshow(image, vmin=limits[0], vmax=limits[1], cmap=map_colours(limits), interpolation="nearest")
-    axes.set_xlabel("column [px]")
-    axes.set_ylabel("row [px]")
+    axes.set(xlabel="column [px]", ylabel="row [px]")
     return axes
 
 

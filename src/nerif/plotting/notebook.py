@@ -105,12 +105,9 @@ def _draw_slices(figure: Figure, volume: Drawable) -> None:
 
 
 def show_views(
-    names: Sequence[str],
-    maps: Sequence[Float[np.ndarray, "row column c"]],
-    components: Sequence[str],
-    label: str,
+    names: Sequence[str], maps: Sequence[Float[np.ndarray, "row column c"]], components: Sequence[str], label: str,
     signed: bool = True,
-) -> str:
+) -> str:  # fmt: skip
     """Return the maps of the views, one row per component, as a data URL of a PNG.
 
     Parameters

@@ -11,7 +11,7 @@ import torch
 
 from nerif.common.files import atomic
 from nerif.geometry import Ring
-from nerif.simulation.design import DesignSettings, expect
+from nerif.simulation.rig_design import DesignSettings, expect
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

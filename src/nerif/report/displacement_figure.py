@@ -11,6 +11,7 @@ from torch import Tensor
 
 from nerif.common.files import atomic
 from nerif.data.measurement import Measurement
+from nerif.geometry import Camera
 from nerif.plotting.drawing import draw_map, plain
 
 if TYPE_CHECKING:
@@ -57,16 +58,14 @@ def save_displacements(path: Path, measurement: Measurement) -> None:
     d = np.where(usable[..., None], d, np.nan)
     limit = float(np.nanpercentile(np.abs(d), 99.5)) or 1.0
     figure, grid = _grid(len(measurement.cameras), 2, 4.6)
-    image = None
     for i, camera in enumerate(measurement.cameras):
-        height, width = camera.image_size
+        inside, extent = _inside(camera, step)
         for k, component in enumerate("uv"):
             axes = grid[2 * (i // COLUMNS) + k, i % COLUMNS]
-            draw_map(axes, d[i, : -(-height // step), : -(-width // step), k], (-limit, limit))
-            image = axes.images[-1]
-            image.set_extent((-0.5, width - 0.5, height - 0.5, -0.5))
+            draw_map(axes, d[i][inside][..., k], (-limit, limit))
+            axes.images[-1].set_extent(extent)
             _label(axes, f"{camera.name}: {component}", i % COLUMNS == 0, k == 1)
-    _save(figure, path, image, grid, "displacement [px]", "both")
+    _save(figure, path, axes.images[-1], grid, "displacement [px]", "both")
 
 
 def save_masks(path: Path, measurement: Measurement, masks_of_views: Bool[Tensor, "view row column"]) -> None:
@@ -77,20 +76,24 @@ def save_masks(path: Path, measurement: Measurement, masks_of_views: Bool[Tensor
     d = np.where(usable, np.linalg.norm(components, axis=-1), np.nan)
     limit = float(np.nanpercentile(d, 99.5)) or 1.0
     figure, grid = _grid(len(measurement.cameras), 1, 2.5)
-    image = None
     for i, camera in enumerate(measurement.cameras):
-        height, width = camera.image_size
-        axes = grid[i // COLUMNS, i % COLUMNS]
-        inside = (i, slice(0, -(-height // step)), slice(0, -(-width // step)))
-        extent = (-0.5, width - 0.5, height - 0.5, -0.5)
-        image = axes.imshow(d[inside], vmin=0, vmax=limit, cmap="viridis", interpolation="nearest", extent=extent)
-        if masks[inside].any() and not masks[inside].all():
-            columns, rows = np.arange(0, width, step), np.arange(0, height, step)
-            axes.contour(columns, rows, masks[inside].astype(float), [0.5], colors="white", linewidths=1)
+        axes, (inside, extent) = grid[i // COLUMNS, i % COLUMNS], _inside(camera, step)
+        mask = masks[i][inside]
+        axes.imshow(d[i][inside], vmin=0, vmax=limit, cmap="viridis", interpolation="nearest", extent=extent)
+        if mask.any() and not mask.all():
+            rows, columns = (np.arange(0, n, step) for n in camera.image_size)
+            axes.contour(columns, rows, mask.astype(float), [0.5], colors="white", linewidths=1)
         _label(axes, camera.name, i % COLUMNS == 0, True)
-    _save(figure, path, image, grid, f"|{observation.technique.measured}| [{observation.technique.unit}]", "max")
+    label = f"|{observation.technique.measured}| [{observation.technique.unit}]"
+    _save(figure, path, axes.images[-1], grid, label, "max")
 
 
 def _step(measurement: Measurement) -> int:
     """Distance of the pixels that are drawn."""
     return max(1, -(-max(measurement.shape[1:]) // MAX_PIXELS))
+
+
+def _inside(camera: Camera, step: int) -> tuple[tuple[slice, slice], tuple[float, float, float, float]]:
+    """The part of a map that the image of a camera takes, and the extent of the image, px."""
+    height, width = camera.image_size
+    return (slice(0, -(-height // step)), slice(0, -(-width // step))), (-0.5, width - 0.5, height - 0.5, -0.5)

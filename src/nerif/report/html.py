@@ -17,9 +17,9 @@ from nerif.data.quantity_names import name_of
 from nerif.forward.registry import technique_of
 from nerif.plotting.drawing import map_colours, plotted_quantities
 from nerif.plotting.notebook import image, number
-from nerif.report import figures, summary
-from nerif.report.journal_figures import residuals_over_sigma
+from nerif.report import summary
 from nerif.report.meridian_figure import draw_centre_line, draw_profiles, draw_section
+from nerif.report.result_plots import plots_of
 from nerif.report.scene import scene_of
 from nerif.report.surface_figure import draw_surface
 from nerif.report.view_images import colour_table, view_images
@@ -73,7 +73,7 @@ def render(result: Result) -> str:
         plane=_plane(meridian),
         plane_title="Around the axis" if meridian is None or meridian.axial else "In the plane of the flow",
         surface=_surface(result),
-        curves=_curves(result),
+        curves=[(plot.title, svg(plot.draw)) for plot in plots_of(result) if plot.title],
         assumptions=[
             (name_of(q).capitalize(), result.volumes[q].notes)
             for q in plotted_quantities(result.volumes)
@@ -137,33 +137,6 @@ def _surface(result: Result) -> tuple[str, str] | None:
     quantity = next(iter(result.surface.quantities))
     title = f"{name_of(quantity).capitalize()} on the surface of the bodies"
     return title, image(partial(draw_surface, surface=result.surface, quantity=quantity), 9, 4.2, 10)
-
-
-def _curves(result: Result) -> list[tuple[str, str]]:
-    """Titles and images of convergence, residuals, rig and accuracy."""
-    metrics = result.metrics
-    curves: list[tuple[str, str]] = []
-
-    def add(title: str, draw: Callable[..., object], *data: Any) -> None:
-        curves.append((title, svg(lambda axes: draw(axes, *data))))
-
-    if result.history:
-        add("Convergence", figures.draw_history, result.history)
-    if result.reprojection is not None:
-        several = len(result.reprojection.measurement.observations) > 1
-        for name, residuals in residuals_over_sigma(result.reprojection).items():
-            add(f"Residuals{f' of {name}' if several else ''} over the noise", figures.draw_residuals, residuals)
-    if rig := metrics.rig:
-        add("Corrections of the cameras", figures.draw_corrections, rig)
-        if result.reprojection is not None:
-            add("Refined camera positions", figures.draw_refined_rig, result.reprojection.measurement.cameras, rig)
-    for quantity in figures.banded(result.volumes):
-        add(f"{name_of(quantity).capitalize()} with bands of 90 %", figures.draw_bands, result.volumes, quantity)
-    if metrics.coverage and "reliability" in metrics.coverage:
-        add("Reliability of the bands, against the truth", figures.draw_reliability, metrics.coverage)
-    if metrics.slices:
-        add("Against the truth, slice by slice", figures.draw_slice_scores, metrics.slices)
-    return curves
 
 
 def svg(draw: Callable[[Axes], object]) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -31,23 +31,21 @@ from nerif.plotting.drawing import (
     plotted_quantities,
     plotted_values,
 )
-from nerif.report import figures
 from nerif.report.isosurface import default_level, draw_isosurface
 from nerif.report.journals import JOURNALS
 from nerif.report.meridian_figure import draw_centre_line, draw_profiles, draw_section
+from nerif.report.result_plots import draw_line, plots_of
 from nerif.report.surface_figure import draw_surface
-from nerif.report.view_images import lattice_step
 from nerif.results.directory import Result
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["error_of", "figures_of", "residuals_over_sigma", "save_figures"]
+__all__ = ["error_of", "figures_of", "save_figures"]
 
 NOT_IN_FILES = r"[^\w.+-]"
 HATCHED_STD = 0.1  # standard deviation over the range of the colours, above which slices are hatched
 MAX_LINES = 3  # rows or columns of images that are drawn as lines
-MAX_RESIDUALS = 1 << 20
 
 Maps = tuple[Observation, np.ndarray, np.ndarray, np.ndarray | None]
 """An observation of a view: measured, NaN where invalid; predicted; sigma or None: (row, column, c)."""
@@ -70,13 +68,7 @@ def save_figures(result: Result, directory: Path, journal: str = "elsevier", dpi
 
 def figures_of(result: Result, single: float, double: float) -> Iterator[tuple[str, Figure]]:
     """Draw the figures one by one, with their names; `single` and `double` are column widths, mm."""
-    metrics, quantities = result.metrics, plotted_quantities(result.volumes)
-
-    def plot(height_over_width: float, draw: Callable[..., object], *data: Any) -> Figure:
-        figure = _page(single, height_over_width)
-        draw(figure.subplots(), *data)
-        return figure
-
+    quantities = plotted_quantities(result.volumes)
     for quantity in (*quantities, *(f"{q}_std" for q in quantities)):
         if quantity in result.volumes:
             std = result.volumes.get(f"{quantity}_std")
@@ -94,7 +86,9 @@ def figures_of(result: Result, single: float, double: float) -> Iterator[tuple[s
     if (meridian := result.meridian) is not None:
         plots = ("section", draw_section), ("profiles", draw_profiles), ("centre_line", draw_centre_line)
         for quantity, (name, draw) in itertools.product(plotted_quantities(meridian.quantities), plots):
-            yield f"{name}_{quantity}", plot(0.9 if name == "section" else 0.7, draw, meridian, quantity)
+            figure = _page(single, 0.9 if name == "section" else 0.7)
+            draw(figure.subplots(), meridian, quantity)
+            yield f"{name}_{quantity}", figure
     if result.reprojection is not None:
         used: set[str] = set()
         for i, name in enumerate(result.reprojection.measurement.names):
@@ -102,22 +96,11 @@ def figures_of(result: Result, single: float, double: float) -> Iterator[tuple[s
             plain = plain if plain not in used else f"{plain}_{i}"
             used.add(plain)
             yield f"view_{plain}", view(result.reprojection, i, double)
-        several = len(result.reprojection.measurement.observations) > 1
-        for measured, residuals in residuals_over_sigma(result.reprojection).items():
-            yield f"residuals_{measured}" if several else "residuals", plot(0.7, figures.draw_residuals, residuals)
         yield "rig", rig(result.reprojection, double)
-    if metrics.rig:
-        yield "corrections", plot(0.8, figures.draw_corrections, metrics.rig)
-    if metrics.views:
-        yield "views", plot(0.8, figures.draw_view_scores, metrics.views)
-    for quantity in figures.banded(result.volumes):
-        yield f"bands_{quantity}", plot(0.7, figures.draw_bands, result.volumes, quantity)
-    if metrics.coverage and "reliability" in metrics.coverage:
-        yield "reliability", plot(0.9, figures.draw_reliability, metrics.coverage)
-    if result.history:
-        yield "history", plot(0.7, figures.draw_history, result.history)
-    if metrics.slices:
-        yield "slice_scores", plot(0.7, figures.draw_slice_scores, metrics.slices)
+    for plot in plots_of(result):
+        figure = _page(single, plot.height)
+        plot.draw(figure.subplots())
+        yield plot.name, figure
 
 
 def _page(width: float, height_over_width: float, layout: str = "constrained") -> Figure:
@@ -204,33 +187,11 @@ def _lines(maps: list[Maps], width: float) -> Figure:
     for (k, c, (o, measured, predicted, sigma)), above, below in zip(panels, grid[::2], grid[1::2], strict=True):
         line = (slice(None), k, c) if upright else (k, slice(None), c)
         deviation, label = None if sigma is None else sigma[line], f"{o.components[c]} [{o.technique.unit}]"
-        figures.draw_line((above, below), measured[line], predicted[line], deviation, label)
+        draw_line((above, below), measured[line], predicted[line], deviation, label)
         above.set_title(f"{across} {k}" if count > 1 else "")
     grid[-1].set_xlabel(f"{along} [px]")
     figure.align_ylabels(grid)
     return figure
-
-
-def residuals_over_sigma(reprojection: Reprojection, max_pixels: int = MAX_RESIDUALS) -> dict[str, np.ndarray]:
-    """Return (predicted - measured) / sigma of every usable pixel whose ray crosses the box, by measured quantity.
-
-    Of more than `max_pixels` pixels, a regular lattice; quantities without sigma are left out.
-    """
-    m = reprojection.measurement
-    step, residuals = lattice_step(m, max_pixels), {}
-    for o in m.observations:
-        if o.sigma is None:
-            continue
-        usable, parts = m.usable_for(o), []
-        for i, camera in enumerate(m.cameras):
-            rows, columns = (slice(0, n, step) for n in camera.image_size)
-            pixels = camera.pixel_grid()[::step, ::step]
-            crosses = camera.rays(pixels.reshape(-1, 2), sensitivity=False).clip(m.box).crosses
-            valid = usable[i, rows, columns] & crosses.reshape(pixels.shape[:2])
-            residual = reprojection.maps[o.technique.name][i, rows, columns] - o.values[i, rows, columns]
-            parts.append((residual[valid] / o.sigma[i, rows, columns][valid]).flatten())
-        residuals[o.technique.measured] = torch.cat(parts).numpy()
-    return residuals
 
 
 def rig(reprojection: Reprojection, width: float) -> Figure:

@@ -111,18 +111,12 @@ def save_rig(path: Path, cameras: Sequence[Camera], box: Box | None = None) -> N
 
 @dataclass(frozen=True)
 class ImageCorners:
-    """The lines of sight of the four corners of an image, the top edge first; mm.
-
-    Parameters
-    ----------
-    start : (4, 3) where to begin drawing: the optical centre, or points of a telecentric beam before the target
-    direction : (4, 3) unit vectors, away from the camera
-    end : (4, 3) on the background or, without one, at the depth of the target
-    """
+    """The lines of sight of the four corners of an image, the top edge first; mm."""
 
     start: Float[np.ndarray, "4 3"]
-    direction: Float[np.ndarray, "4 3"]
-    end: Float[np.ndarray, "4 3"]
+    """Where to begin drawing: the optical centre, or points of a telecentric beam before the target."""
+    direction: Float[np.ndarray, "4 3"]  #: unit vectors, away from the camera
+    end: Float[np.ndarray, "4 3"]  #: on the background or, without one, at the depth of the target
 
 
 def image_corners(camera: Camera, target: Float[np.ndarray, 3]) -> ImageCorners:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,14 +17,14 @@ from nerif.forward.registry import technique, technique_of
 from nerif.plotting.drawing import plain
 from nerif.plotting.notebook import number
 from nerif.report.html import flat, render_page, svg
-from nerif.report.movie import finished_frames
 from nerif.report.scene import scene_over_time
 from nerif.report.summary import Statement
+from nerif.report.volume_movie import finished_frames
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["render_sequence"]
+__all__ = ["frame_rows", "render_sequence"]
 
 MAX_FRAMES = 60  # on the page
 
@@ -53,7 +54,7 @@ def render_sequence(store: VolumeSequence) -> str:
         source=Path(str(measurement)).name if measurement else "",
         headline=incomplete if missing else complete,
         statements=_statements(store),
-        cards=(("Frames", _frame_rows(store, frames)), ("Fit", _fit_rows(store, frames))),
+        cards=(("Frames", frame_rows(store, frames)), ("Fit", _fit_rows(store, frames))),
         scene=scene,
         arrays=arrays,
         curves=_curves(store, frames),
@@ -80,7 +81,8 @@ def _statements(store: VolumeSequence) -> list[Statement]:
     return remarks
 
 
-def _frame_rows(store: VolumeSequence, frames: list[int]) -> list[tuple[str, str]]:
+def frame_rows(store: VolumeSequence, frames: Sequence[int]) -> list[tuple[str, str]]:
+    """Return number, instants and grid of the finished frames of a store."""
     times = store.times
     rows = [
         ("Frames", f"{len(frames)} of {len(store)}"),

@@ -46,16 +46,10 @@ Rows = list[tuple[str, str]]
 
 @dataclass(frozen=True)
 class Statement:
-    """A statement on the accuracy of a result, with the remedy where there is one.
+    """A statement on the accuracy of a result, with the remedy where there is one."""
 
-    Parameters
-    ----------
-    level : good, note, warning or bad
-    text : one or two sentences
-    """
-
-    level: str
-    text: str
+    level: str  #: good, note, warning or bad
+    text: str  #: one or two sentences
 
 
 def measurement_rows(result: Result) -> Rows:

@@ -14,6 +14,7 @@ from nerif.data.volume import COMPONENTS
 from nerif.plotting.notebook import image, number
 from nerif.report.html import flat, render_page, svg
 from nerif.report.scene import scene_over_time
+from nerif.report.sequence_page import MAX_FRAMES, frame_rows
 from nerif.report.summary import LEVEL_OF_RATING, Statement
 from nerif.report.velocity_figure import draw_arrows, draw_streamlines
 
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 
 __all__ = ["render_velocity"]
 
-MAX_FRAMES = 60  # on the page
+
 def render_velocity(store: VelocitySequence) -> str:
     """Return the page of a velocity."""
     frames = np.unique(np.linspace(0, len(store) - 1, min(len(store), MAX_FRAMES)).round().astype(int)).tolist()
@@ -39,7 +40,7 @@ def render_velocity(store: VelocitySequence) -> str:
         source=Path(str(about.get("film", ""))).name,
         headline=_statements(store)[0],
         statements=_statements(store)[1:],
-        cards=(("Film", _film_rows(store)), ("Velocity", _velocity_rows(store))),
+        cards=(("Film", frame_rows(store, range(len(store)))), ("Velocity", _velocity_rows(store))),
         scene=scene,
         arrays=arrays,
         plane=[
@@ -68,15 +69,6 @@ def _statements(store: VelocitySequence) -> list[Statement]:
     if (of_pressure := relative_deviation(store, ("pressure",))) is not None:
         statements.append(Statement("note", f"The standard deviation of the pressure is {of_pressure:.0%} of its rms."))
     return statements
-
-
-def _film_rows(store: VelocitySequence) -> list[tuple[str, str]]:
-    times = store.times
-    return [
-        ("Frames", str(len(store))),
-        ("Time", f"{times[0] * 1e3:.10g} to {times[-1] * 1e3:.10g} ms"),
-        ("Voxels", " × ".join(str(n) for n in store.grid.shape[::-1])),
-    ]
 
 
 def _velocity_rows(store: VelocitySequence) -> list[tuple[str, str]]:

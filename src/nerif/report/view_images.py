@@ -18,7 +18,7 @@ from nerif.data.reprojection import Reprojection
 from nerif.plotting.drawing import map_colours, map_range
 from nerif.results.metrics_file import ViewScores
 
-__all__ = ["Scale", "ViewImages", "colour_table", "image_address", "lattice_step", "view_images"]
+__all__ = ["ColourScale", "PageView", "colour_table", "image_address", "lattice_step", "view_images"]
 
 MAX_PIXELS = 320  # along an edge of an image
 MAX_PAGE_PIXELS = 4_000_000  # of all images: 5 MB of the page
@@ -26,43 +26,26 @@ SCALE_PIXELS = 1 << 20  # from which the ends of the colours are computed
 
 
 @dataclass(frozen=True)
-class Scale:
-    """Colours of a measured quantity, the same in all views.
+class ColourScale:
+    """Colours of a measured quantity, the same in all views."""
 
-    Parameters
-    ----------
-    measured : the quantity
-    unit : "" if dimensionless
-    limits : ends of the colours of measurement and prediction
-    difference_limits : ends of the colours of the difference
-    """
-
-    measured: str
-    unit: str
-    limits: tuple[float, float]
-    difference_limits: tuple[float, float]
+    measured: str  #: the quantity
+    unit: str  #: "" if dimensionless
+    limits: tuple[float, float]  #: ends of the colours of measurement and prediction
+    difference_limits: tuple[float, float]  #: ends of the colours of the difference
 
 
 @dataclass(frozen=True)
-class ViewImages:
-    """The images of a view, as data addresses.
+class PageView:
+    """The images of a view, as data addresses."""
 
-    Parameters
-    ----------
-    name : of the view
-    withheld : whether the reconstruction did not use it
-    scores : cc, ssim, rms, rms_over_sigma of each technique
-    rows : by component, such as u and v: addresses of measurement, prediction, difference
-    size : height and width of the view, px
-    bin_size : pixels (rows, columns) of the view per pixel of the images
-    """
-
-    name: str
-    withheld: bool
-    scores: list[ViewScores]
+    name: str  #: of the view
+    withheld: bool  #: whether the reconstruction did not use it
+    scores: list[ViewScores]  #: cc, ssim, rms, rms_over_sigma of each technique
     rows: dict[str, tuple[str, str, str]]
-    size: tuple[int, int]
-    bin_size: tuple[int, int]
+    """By component, such as u and v: addresses of measurement, prediction, difference."""
+    size: tuple[int, int]  #: height and width of the view, px
+    bin_size: tuple[int, int]  #: pixels (rows, columns) of the view per pixel of the images
 
 
 def colour_table(name: str) -> list[tuple[int, int, int]]:
@@ -78,7 +61,7 @@ def lattice_step(measurement: Measurement, max_pixels: int) -> int:
     return max(1, math.ceil(math.sqrt(views * height * width / max_pixels)))
 
 
-def view_images(reprojection: Reprojection, metrics: list[ViewScores]) -> tuple[list[ViewImages], list[Scale]]:
+def view_images(reprojection: Reprojection, metrics: list[ViewScores]) -> tuple[list[PageView], list[ColourScale]]:
     """Return the images of all views, and the colours of each technique.
 
     The colour range is the 99.8th percentile of the measurement, the 99.5th of the difference, over all views.
@@ -110,11 +93,11 @@ def view_images(reprojection: Reprojection, metrics: list[ViewScores]) -> tuple[
     for camera, row, step in zip(m.cameras, rows, steps, strict=True):
         scores = [v for v in metrics if v.get("name") == camera.name]
         withheld = camera.name in reprojection.withheld
-        views.append(ViewImages(camera.name, withheld, scores, row, camera.image_size, step))
+        views.append(PageView(camera.name, withheld, scores, row, camera.image_size, step))
     return views, scales
 
 
-def _scale(reprojection: Reprojection, observation: Observation) -> Scale:
+def _scale(reprojection: Reprojection, observation: Observation) -> ColourScale:
     m, kind = reprojection.measurement, observation.technique
     usable, step = m.usable_for(observation), lattice_step(m, SCALE_PIXELS)
     lattice = usable[:, ::step, ::step]
@@ -123,7 +106,7 @@ def _scale(reprojection: Reprojection, observation: Observation) -> Scale:
     values = observation.values[:, ::step, ::step][lattice]
     difference = reprojection.maps[kind.name][:, ::step, ::step][lattice] - values
     limits = map_range(values.numpy(), observation.signed, 0.998)
-    return Scale(kind.measured, unit_shown(kind.unit), limits, map_range(difference.numpy(), True, 0.995))
+    return ColourScale(kind.measured, unit_shown(kind.unit), limits, map_range(difference.numpy(), True, 0.995))
 
 
 def _shrink(image: Float[np.ndarray, "row column"], step: tuple[int, int]) -> Float[np.ndarray, "r c"]:

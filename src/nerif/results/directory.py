@@ -32,23 +32,15 @@ from nerif.geometry import Box, Grid
 from nerif.geometry.body import Body
 from nerif.geometry.symmetry import Symmetry
 from nerif.reconstruction import field_files
-from nerif.reconstruction.field_files import (
-    CHECKPOINT,
-    FIELD,
-    read_bodies,
-    read_field,
-    read_quantity,
-    read_rig,
-    read_state,
-)
+from nerif.reconstruction.field_files import CHECKPOINT, FIELD
 from nerif.reconstruction.methods import METHODS
 from nerif.reconstruction.reconstructor import Reconstruction, State, sampled
 from nerif.reconstruction.rig_parameters import RefinedView
 from nerif.results.metrics_file import Metrics
 
 __all__ = [
-    "CALIBRATION", "FIGURES", "METRICS", "REPORT", "RUN", "SURFACE", "VOLUME", "Gap", "Result", "ResultDirectory",
-    "check_links", "versions",
+    "CALIBRATION", "FIGURES", "METRICS", "REPORT", "RUN", "SURFACE", "VOLUME", "VOLUME_VTI", "Gap", "Result",
+    "ResultDirectory", "check_links", "versions",
 ]  # fmt: skip
 
 METRICS, HISTORY, REPORT = "metrics.json", "history.csv", "report.html"
@@ -66,48 +58,28 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Gap:
-    """A missing or damaged file of a result.
+    """A missing or damaged file of a result."""
 
-    Parameters
-    ----------
-    name : of the file, or "truth"
-    sentence : the consequence, and the remedy
-    """
-
-    name: str
-    sentence: str
+    name: str  #: of the file, or "truth"
+    sentence: str  #: the consequence, and the remedy
 
 
 @dataclass(frozen=True)
 class Result:
-    """The content of a result directory.
+    """The content of a result directory."""
 
-    Parameters
-    ----------
-    directory : its path
-    settings : of run.toml; empty if missing
-    about : the table [about] of run.toml: versions, outcome
-    metrics : of metrics.json; all empty if missing
-    history : records of history.csv, blanks as NaN
-    volumes : by quantity; with error bars also index_excess_std, density_std, ...
-    reprojection : measured and predicted views, or None
-    measurement : or None
-    truth : field it was compared with, an index relative to the ambient of the result, or None
-    surface : quantities on the surface of bodies, or None
-    missing : files that are missing or damaged
-    """
-
-    directory: Path
-    settings: dict[str, Any] = field(default_factory=dict)
-    about: dict[str, Any] = field(default_factory=dict)
-    metrics: Metrics = field(default_factory=Metrics)
-    history: list[dict[str, float]] = field(default_factory=list)
+    directory: Path  #: its path
+    settings: dict[str, Any] = field(default_factory=dict)  #: of run.toml; empty if missing
+    about: dict[str, Any] = field(default_factory=dict)  #: the table [about] of run.toml: versions, outcome
+    metrics: Metrics = field(default_factory=Metrics)  #: of metrics.json; all empty if missing
+    history: list[dict[str, float]] = field(default_factory=list)  #: records of history.csv, blanks as NaN
     volumes: dict[str, Volume] = field(default_factory=dict)
-    reprojection: Reprojection | None = None
-    measurement: Measurement | None = None
-    truth: Volume | None = None
-    surface: SurfaceMap | None = None
-    missing: tuple[Gap, ...] = ()
+    """By quantity; with error bars also index_excess_std, density_std, ..."""
+    reprojection: Reprojection | None = None  #: measured and predicted views, or None
+    measurement: Measurement | None = None  #: or None
+    truth: Volume | None = None  #: field it was compared with, an index relative to the ambient of the result, or None
+    surface: SurfaceMap | None = None  #: quantities on the surface of bodies, or None
+    missing: tuple[Gap, ...] = ()  #: files that are missing or damaged
 
     @property
     def field(self) -> Volume | None:
@@ -147,6 +119,7 @@ class ResultDirectory:
     def __init__(self, path: str | os.PathLike[str], say: Callable[[str], None] = WARN) -> None:
         self.path = Path(path)
         self.files = OwnFiles(self.path, say)
+        self.begun = False  # whether `begin` has prepared it
         check_links(self.path)
 
     def __truediv__(self, name: str) -> Path:
@@ -180,6 +153,7 @@ class ResultDirectory:
         if not resume:
             self.clear()
         self.write_settings(settings)
+        self.begun = True
 
     def clear(self) -> None:
         """Remove the files of an earlier run; foreign files with names that a run needs are renamed.
@@ -258,11 +232,11 @@ class ResultDirectory:
 
     def field(self) -> tuple[Field, Box, float]:
         """Return the field, its box (mm) and n_ambient."""
-        return read_field(self.path)
+        return field_files.read_field(self.path)
 
     def bodies(self) -> tuple[Body, ...]:
         """Return the bodies in the flow."""
-        return read_bodies(self.path)
+        return field_files.read_bodies(self.path)
 
     def sample(self, grid: Grid) -> Volume:
         """Return the field at the voxel centres of a grid, NaN within bodies."""
@@ -271,15 +245,15 @@ class ResultDirectory:
 
     def quantity(self) -> str:
         """Return the quantity of the field (volume.QUANTITIES)."""
-        return read_quantity(self.path)
+        return field_files.read_quantity(self.path)
 
     def rig(self) -> list[RefinedView]:
         """Return the corrections of the cameras; none if they were not refined."""
-        return read_rig(self.path)
+        return field_files.read_rig(self.path)
 
     def state(self) -> State:
         """Return the checkpoint."""
-        return read_state(self.path)
+        return field_files.read_state(self.path)
 
     def settings(self) -> dict[str, Any]:
         """Return run.toml with [about]; empty if there is none."""
@@ -355,40 +329,27 @@ class ResultDirectory:
         metrics = attempt(
             METRICS, self.metrics, Metrics(), "no comparison with the views; nerif evaluate --measurement FILE adds it"
         )
-        history: list[dict[str, float]] = []
-        volumes: dict[str, Volume] = {}
-        reprojection, measurement = None, None
-        surface: SurfaceMap | None = None
+        parts: dict[str, Any] = {"volumes": {}, "history": []}
         if views:
-            history = attempt(HISTORY, self.history, history, "no convergence curves")
+            parts["history"] = attempt(HISTORY, self.history, parts["history"], "no convergence curves")
         if views or metrics.uncertainty:
-            volumes = attempt(VOLUME, self.volumes, volumes, "no field to show; nerif export writes it")
+            consequence = "no field to show; nerif export writes it"
+            parts["volumes"] = attempt(VOLUME, self.volumes, parts["volumes"], consequence)
         if views:
-            reprojection = attempt(
-                REPROJECTION, self.reprojection, None, "no views to show; nerif evaluate --measurement FILE adds them"
-            )
-            measurement = self._measurement(run) if reprojection is None else reprojection.measurement
-            if self.has(SURFACE[0]):
-                surface = attempt(SURFACE[0], lambda: SurfaceMap.read(self / SURFACE[0]), None, "no surface to show")
+            consequence = "no views to show; nerif evaluate --measurement FILE adds them"
+            parts["reprojection"] = reprojection = attempt(REPROJECTION, self.reprojection, None, consequence)
+            parts["measurement"] = self._measurement(run) if reprojection is None else reprojection.measurement
+            if self.has(name := SURFACE[0]):
+                parts["surface"] = attempt(name, lambda: SurfaceMap.read(self / name), None, "no surface to show")
+            parts["truth"] = self._truth(metrics, parts["volumes"], gaps)
         if not finished:
             remedy = "Start it again"
             if self.has(CHECKPOINT):
                 remedy = f"Continue with {command_line(['reconstruct', '--resume', '-o', word_of(self.path)])}"
             rest = f" Not written yet: {', '.join(pending)}." if pending else ""
             gaps.insert(0, Gap(FIELD, f"The run has not ended: there is no {FIELD}. {remedy}.{rest}"))
-        return Result(
-            directory=self.path,
-            settings={k: v for k, v in run.items() if k != "about"},
-            about=run.get("about", {}),
-            metrics=metrics,
-            history=history,
-            volumes=volumes,
-            reprojection=reprojection,
-            measurement=measurement,
-            truth=self._truth(metrics, volumes, gaps) if views else None,
-            surface=surface,
-            missing=tuple(gaps),
-        )
+        about = run.pop("about", {})
+        return Result(self.path, settings=run, about=about, metrics=metrics, **parts, missing=tuple(gaps))
 
     def _truth(self, metrics: Metrics, volumes: dict[str, Volume], gaps: list[Gap]) -> Volume | None:
         """The truth of an evaluation, at its path or, if both were moved, beside the result."""

@@ -53,34 +53,21 @@ CURVE_POINTS = 400  # at most; then every second is dropped
 
 @dataclass(frozen=True)
 class LiveSnapshot:
-    """The field during a run, and one of its views.
+    """The field during a run, and one of its views."""
 
-    Parameters
-    ----------
-    title : of the work
-    seconds : since its start
-    quantity : of the field (volume.QUANTITIES)
-    values : [z, y, x] of it
-    lower, upper : corners of its box, mm
-    view : name of the view; empty if there is none
-    withheld : whether the run does not use the view
-    measured, predicted : (row, column, component) of the view, on a lattice of pixels; NaN where not measured
-    components : their names
-    unit : of measured and predicted
-    """
-
-    title: str
-    seconds: float
-    quantity: str
-    values: np.ndarray
-    lower: tuple[float, float, float]
+    title: str  #: of the work
+    seconds: float  #: since its start
+    quantity: str  #: of the field (volume.QUANTITIES)
+    values: np.ndarray  #: [z, y, x] of it
+    lower: tuple[float, float, float]  #: corner of its box, mm
     upper: tuple[float, float, float]
-    view: str
-    withheld: bool
+    view: str  #: name of the view; empty if there is none
+    withheld: bool  #: whether the run does not use the view
     measured: np.ndarray
-    predicted: np.ndarray
-    components: tuple[str, ...]
-    unit: str
+    """(row, column, component) of the view, on a lattice of pixels; NaN where not measured."""
+    predicted: np.ndarray  #: the same from the field
+    components: tuple[str, ...]  #: their names
+    unit: str  #: of measured and predicted
 
     @property
     def volume(self) -> Volume:
@@ -111,28 +98,28 @@ class Live:
         self._curve: list[dict[str, float]] = []
         self._interval, self._failed = 1, False
 
-    def watching(self, monitor: Monitor, withheld: bool, looks: bool = True) -> Monitor:
+    def watching(self, monitor: Monitor, withheld: bool, snapshots: bool = True) -> Monitor:
         """Return a monitor that also writes the status.
 
         Parameters
         ----------
         withheld : whether the run does not use the view
-        looks : whether to write the field
+        snapshots : whether to write the field
         """
 
         @contextmanager
         def training(title: str) -> Iterator[OnStep]:
             with monitor.training(title) as on_step:
                 newest: list[Step] = []
-                yield compose(self._writer(title, withheld, looks, newest), on_step)
+                yield compose(self._writer(title, withheld, snapshots, newest), on_step)
             if newest:  # the last step
                 self._attempt(self._write, title, newest[0])
-                if looks:
+                if snapshots:
                     self._attempt(self._write_snapshot, title, newest[0], withheld)
 
         return replace(monitor, training=training)
 
-    def _writer(self, title: str, withheld: bool, looks: bool, newest: list[Step]) -> OnStep:
+    def _writer(self, title: str, withheld: bool, snapshots: bool, newest: list[Step]) -> OnStep:
         status, field = time.monotonic(), time.monotonic() + FIELD_DELAY  # when each is due
         is_first = True
         self._curve, self._interval = [], 1
@@ -147,7 +134,7 @@ class Live:
             if now >= status:
                 self._attempt(self._write, title, step)
                 status = now + STATUS_INTERVAL
-            if looks and now >= field:
+            if snapshots and now >= field:
                 self._attempt(self._write_snapshot, title, step, withheld)
                 end = time.monotonic()
                 field, is_first = end + _pause(end - now, is_first), False

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass, field
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Annotated, Any, Literal, NotRequired
 
@@ -29,17 +29,12 @@ class ResidualTest(TypedDict):
     """Test of the residual of a view for whiteness."""
 
     white: bool
-    grain: float
-    """1 for white noise, larger for correlated residuals."""
-    cause: str
-    """Whose pattern it has (remedies.CAUSES), or empty."""
-    share: float
-    """Fraction of the correlated part that the cause explains."""
+    grain: float  #: 1 for white noise, larger for correlated residuals
+    cause: str  #: whose pattern it has (remedies.CAUSES), or empty
+    share: float  #: fraction of the correlated part that the cause explains
     row: float
-    column: float
-    """Position of its largest part, px."""
-    correlated: float
-    """The spatially correlated part over the rms."""
+    column: float  #: position of its largest part, px
+    correlated: float  #: the spatially correlated part over the rms
 
 
 class ViewScores(TypedDict):
@@ -47,30 +42,21 @@ class ViewScores(TypedDict):
 
     name: str
     withheld: bool
-    measured: str
-    """The quantity."""
-    unit: str
-    """Unit of all rms values."""
+    measured: str  #: the quantity
+    unit: str  #: unit of all rms values
     cc: Score
     ssim: Score
-    psnr: Score
-    """dB."""
-    rms: Score
-    """rms of the residual."""
+    psnr: Score  #: dB
+    rms: Score  #: rms of the residual
     pixels: int
     rms_predicted: Score
     rms_measured: Score
-    rms_white: NotRequired[Score]
-    """Pixel-to-pixel noise, estimated from the residual."""
-    rms_sigma: NotRequired[Score]
-    """Stated noise."""
+    rms_white: NotRequired[Score]  #: pixel-to-pixel noise, estimated from the residual
+    rms_sigma: NotRequired[Score]  #: stated noise
     rms_over_sigma: NotRequired[Score]
-    residual_test: NotRequired[ResidualTest]
-    """Given enough pixels."""
-    cut_edge: NotRequired[str]
-    """Edge of the image, left, right, top or bottom, at which the flow is cut off most."""
-    cut_signal: NotRequired[Score]
-    """Rms of the signal along it over that of the image."""
+    residual_test: NotRequired[ResidualTest]  #: given enough pixels
+    cut_edge: NotRequired[str]  #: edge of the image, left, right, top or bottom, at which the flow is cut off most
+    cut_signal: NotRequired[Score]  #: rms of the signal along it over that of the image
 
 
 class PredictionAccuracy(TypedDict):
@@ -79,34 +65,27 @@ class PredictionAccuracy(TypedDict):
     measured: str
     unit: str
     method: str
-    error: float
-    """Rms difference from the path integral through the field; 0 if the prediction is that integral."""
-    pixels: int
-    """Pixels on which they were compared."""
+    error: float  #: rms difference from the path integral through the field; 0 if the prediction is that integral
+    pixels: int  #: pixels on which they were compared
 
 
 class WithheldRun(TypedDict):
     """Cross-validation: the first run, without one view."""
 
-    views: list[ViewScores]
-    """Scores of the withheld view."""
-    fitted_views: list[ViewScores]
-    """Scores of one of the others."""
+    views: list[ViewScores]  #: scores of the withheld view
+    fitted_views: list[ViewScores]  #: scores of one of the others
     seconds: float
 
 
 class AxisEstimate(TypedDict):
     """The axis of a symmetric flow; parameters by name, mm and rad."""
 
-    symmetry: dict[str, Any]
-    """Fields of geometry.Symmetry."""
+    symmetry: dict[str, Any]  #: fields of geometry.Symmetry
     values: dict[str, float]
     prior_sigma: dict[str, float]
     posterior_sigma: dict[str, float]
-    constrained: dict[str, bool]
-    """By the data."""
-    better_direction: NotRequired[list[float]]
-    """About which a coarse field fits far better."""
+    constrained: dict[str, bool]  #: by the data
+    better_direction: NotRequired[list[float]]  #: about which a coarse field fits far better
 
 
 class HalfAsymmetry(TypedDict):
@@ -115,8 +94,7 @@ class HalfAsymmetry(TypedDict):
     name: str
     measured: str
     cc: dict[str, float]
-    antisymmetry: float
-    """Antisymmetric fraction of the signal."""
+    antisymmetry: float  #: antisymmetric fraction of the signal
 
 
 class Uncertainty(TypedDict):
@@ -124,27 +102,22 @@ class Uncertainty(TypedDict):
 
     kind: str
     trials: int
-    diverged_trials: list[int]
-    """Excluded ones."""
+    diverged_trials: list[int]  #: excluded ones
     seconds: float
-    source: NotRequired[str]
-    """bootstrap, or posterior."""
+    source: NotRequired[str]  #: bootstrap, or posterior
 
 
 class DetailEntries(TypedDict):
     """Detail added to the field of the method (reconstruction/detail/detail.py)."""
 
-    residual_before: float
-    """Rms over sigma, without and with it."""
+    residual_before: float  #: rms over sigma, without and with it
     residual_after: float
     withheld_before: Score
     """The same of the withheld view in the cross-validation: of rough trials on a coarse grid, and of pixels by which
     nothing was chosen. NaN without one."""
     withheld_after: Score
-    blurred: bool
-    """Whether it was added to the blurred field."""
-    voxels: int
-    """Along the longest edge of the box."""
+    blurred: bool  #: whether it was added to the blurred field
+    voxels: int  #: along the longest edge of the box
     iterations: int
     seconds: float
 
@@ -175,10 +148,8 @@ class Coverage(TypedDict):
     two_sigma: Score
     one_sigma_in_flow: Score
     two_sigma_in_flow: Score
-    reliability: NotRequired[list[float]]
-    """In the flow, within the bands of metrics.LEVELS."""
-    spearman: Score
-    """Rank correlation of |error| and standard deviation."""
+    reliability: NotRequired[list[float]]  #: in the flow, within the bands of metrics.LEVELS
+    spearman: Score  #: rank correlation of |error| and standard deviation
 
 
 @with_config(ConfigDict(extra="forbid"))
@@ -188,15 +159,11 @@ class Metrics:
 
     version: Literal[1] = 1
 
-    measurement: str | None = None
-    """File of the views, absolute path."""
-    seconds: float | None = None
-    """Duration of the main run."""
-    peak_memory_bytes: int | None = None
-    """Tensors on a GPU, the whole process on a CPU."""
+    measurement: str | None = None  #: file of the views, absolute path
+    seconds: float | None = None  #: duration of the main run
+    peak_memory_bytes: int | None = None  #: tensors on a GPU, the whole process on a CPU
     device: str | None = None
-    outcome: str | None = None
-    """Why it ended: converged, ..."""
+    outcome: str | None = None  #: why it ended: converged, ...
     message: str | None = None
     cross_validation: WithheldRun | None = None
 
@@ -205,12 +172,10 @@ class Metrics:
     views: list[ViewScores] = field(default_factory=list)
     reprojection: list[PredictionAccuracy] = field(default_factory=list)
 
-    rig: list[RefinedView] = field(default_factory=list)
-    """Refined cameras."""
+    rig: list[RefinedView] = field(default_factory=list)  #: refined cameras
     withheld_rig: list[RefinedView] = field(default_factory=list)
     """Cameras of withheld views, refined against the field."""
-    withheld_views: list[ViewScores] = field(default_factory=list)
-    """Withheld views, predicted with these cameras."""
+    withheld_views: list[ViewScores] = field(default_factory=list)  #: withheld views, predicted with these cameras
 
     axis: AxisEstimate | None = None
     asymmetry: list[HalfAsymmetry] = field(default_factory=list)
@@ -218,18 +183,15 @@ class Metrics:
     uncertainty: Uncertainty | None = None
     verdict: VerdictEntries | None = None
 
-    truth: str | None = None
-    """File of the true field, absolute path."""
-    quantity: str | None = None
-    """Quantity of the field that was compared with it."""
+    truth: str | None = None  #: file of the true field, absolute path
+    quantity: str | None = None  #: quantity of the field that was compared with it
     l2: Score | None = None
     l2_variation: Score | None = None
     cc: Score | None = None
     ssim: Score | None = None
     psnr: Score | None = None
     slices: list[SliceScores] = field(default_factory=list)
-    aligned: dict[str, Any] | None = None
-    """The same after the best rigid motion, `rotation_rad` and `shift_mm`."""
+    aligned: dict[str, Any] | None = None  #: the same after the best rigid motion, `rotation_rad` and `shift_mm`
     coverage: Coverage | None = None
 
     @classmethod
@@ -263,6 +225,4 @@ class Metrics:
         write_json(path, {name: value for name, value in asdict(self).items() if value not in (None, [])})
 
 
-@cache
-def _adapter() -> TypeAdapter[Metrics]:
-    return TypeAdapter(Metrics)
+_adapter = cache(partial(TypeAdapter, Metrics))

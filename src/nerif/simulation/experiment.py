@@ -38,8 +38,7 @@ SIDES = {
 }
 """World axes along the axes of an upright target, by the x and y direction of the world that it faces."""
 
-KINDS = ("target", "background", "reference", "flow")
-"""Folders of a view."""
+KINDS = ("target", "background", "reference", "flow")  #: folders of a view
 
 ORIGIN = torch.zeros(3, dtype=torch.float64)
 

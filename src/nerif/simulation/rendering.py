@@ -24,23 +24,14 @@ __all__ = ["Texture", "background_texture", "pattern_size", "render"]
 
 @dataclass(frozen=True)
 class Texture:
-    """A printed plane in space.
+    """A printed plane in space."""
 
-    Parameters
-    ----------
-    values : reflectance, 0 to 1
-    texel : edge of a texel, mm
-    corner : outer corner of the first texel, mm, world frame
-    right, down : unit vectors along columns and rows
-    surround : reflectance beyond the edges
-    """
-
-    values: Float[Tensor, "row column"]
-    texel: float
-    corner: Float[Tensor, 3]
-    right: Float[Tensor, 3]
-    down: Float[Tensor, 3]
-    surround: float = 0.5
+    values: Float[Tensor, "row column"]  #: reflectance, 0 to 1
+    texel: float  #: edge of a texel, mm
+    corner: Float[Tensor, 3]  #: outer corner of the first texel, mm, world frame
+    right: Float[Tensor, 3]  #: unit vector along columns
+    down: Float[Tensor, 3]  #: unit vector along rows
+    surround: float = 0.5  #: reflectance beyond the edges
 
     @classmethod
     def around(
@@ -94,14 +85,9 @@ def pattern_size(camera: Camera) -> tuple[float, float]:
 
 @torch.no_grad()
 def render(
-    camera: Camera,
-    texture: Texture,
-    field: Field | None = None,
-    box: Box | None = None,
-    n_ambient: float = 1.0,
-    samples: int = 3,
-    steps: int = STEPS,
-) -> Float[Tensor, "row column"]:
+    camera: Camera, texture: Texture, field: Field | None = None, box: Box | None = None, n_ambient: float = 1.0,
+    samples: int = 3, steps: int = STEPS,
+) -> Float[Tensor, "row column"]:  # fmt: skip
     """Return the light that reaches each pixel, 0 (black) to 1 (white paper).
 
     Parameters

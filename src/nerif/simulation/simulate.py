@@ -94,18 +94,10 @@ def add_quantum_noise(measurement: Measurement, counts: float, seed: int = 0) ->
 
 
 def simulate(
-    field: Field,
-    cameras: Sequence[Camera],
-    box: Box,
-    n_ambient: float,
-    noise: float = 0.0,
-    seed: int = 0,
-    steps: int = STEPS,
-    wavelength_nm: float | None = None,
-    ambient_faces: tuple[str, ...] = DEFAULT_AMBIENT_FACES,
-    on_view: Callable[[int], None] | None = None,
-    techniques: Sequence[type[ForwardModel]] = (ASSUMED,),
-) -> Measurement:
+    field: Field, cameras: Sequence[Camera], box: Box, n_ambient: float, noise: float = 0.0, seed: int = 0,
+    steps: int = STEPS, wavelength_nm: float | None = None, ambient_faces: tuple[str, ...] = DEFAULT_AMBIENT_FACES,
+    on_view: Callable[[int], None] | None = None, techniques: Sequence[type[ForwardModel]] = (ASSUMED,),
+) -> Measurement:  # fmt: skip
     """Return a simulated measurement of a field.
 
     Parameters

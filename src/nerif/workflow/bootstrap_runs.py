@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from collections.abc import Sequence
 from typing import Any
 
 from nerif.analysis.prediction import reproject
@@ -12,16 +12,15 @@ from nerif.data.volume import Volume
 from nerif.fields.field import Field
 from nerif.geometry import Grid
 from nerif.physics.quantities import GasSettings, derive_all, masked_lines
-from nerif.reconstruction.progress import QUIET, Monitor
-from nerif.reconstruction.reconstructor import Reconstruction, Reconstructor
-from nerif.reconstruction.uncertainty.bootstrap import BootstrapDeviations, Maps, Original, Trials
+from nerif.reconstruction.progress import Monitor
+from nerif.reconstruction.reconstructor import Reconstruction
+from nerif.reconstruction.uncertainty.bootstrap import BootstrapDeviations, Maps, Original
 from nerif.reconstruction.uncertainty.deviations import Deviations, certainty
-from nerif.reconstruction.uncertainty.rig_posterior import RigPosterior
 from nerif.results.directory import ResultDirectory
-from nerif.workflow.budget import NO_LIMIT, Budget
 from nerif.workflow.checkpointed import CheckpointedRun
+from nerif.workflow.reconstruction_run import ReconstructionRun, StepOutputs
 
-__all__ = ["Members", "all_quantities", "write_deviations"]
+__all__ = ["all_quantities", "bootstrap", "write_deviations"]
 
 
 def all_quantities(result: Reconstruction, gas: GasSettings, voxels: int) -> list[Volume]:
@@ -30,8 +29,9 @@ def all_quantities(result: Reconstruction, gas: GasSettings, voxels: int) -> lis
 
 
 def write_deviations(
-    out: ResultDirectory, monitor: Monitor, quantities: list[Volume], deviations: Deviations, entries: dict[str, Any]
-) -> None:
+    out: ResultDirectory, monitor: Monitor, quantities: Sequence[Volume], deviations: Deviations,
+    entries: dict[str, Any],
+) -> None:  # fmt: skip
     """Write the standard deviations of all quantities beside them, and the section of metrics.json."""
     volumes = [*quantities, *deviations.volumes()]
     std = next(v for v in volumes if v.quantity == f"{volumes[0].quantity}_std")
@@ -46,64 +46,42 @@ def write_deviations(
     monitor.say(f"uncertainty from {deviations.count} {samples}: {size}")
 
 
-@dataclass(frozen=True)
-class Members:
-    """Bootstrap trials in a result directory.
+def bootstrap(run: ReconstructionRun, so_far: StepOutputs) -> StepOutputs:
+    """Add standard deviations to the volumes, from trials; writes and resumes from trials/.
 
-    Parameters
-    ----------
-    out : directory with the main result
-    trials : kind and number
-    reconstructor : settings of the main result
-    training : data of the main result, with the calibrated cameras
-    rig : the refined rig of the main result, if it was refined
-    start : initial field, or None
-    checkpoint_every : s
-    monitor : of the progress
-    budget : time left for the trials
+    Complete trials of an interrupted run are read; a diverged one is excluded.
     """
+    main, count, monitor = so_far.the_result, run.trials.members, run.watching(withheld=False, snapshots=False)
+    if not count or so_far.has_error_draws or main.outcome.reason == "interrupted":
+        return so_far
+    if main.outcome.failed:
+        run.monitor.say(f"uncertainty: skipped: the main run {main.outcome.reason}")
+        return so_far
 
-    out: ResultDirectory
-    trials: Trials
-    reconstructor: Reconstructor
-    training: Measurement
-    rig: RigPosterior | None = None
-    start: Field | None = None
-    checkpoint_every: float = 60.0
-    monitor: Monitor = QUIET
-    budget: Budget = NO_LIMIT
-
-    def add_to(self, main: Reconstruction, quantities: list[Volume], gas: GasSettings) -> None:
-        """Run the trials, and write standard deviations beside the quantities of the main result.
-
-        Complete trials of an interrupted run are read; a diverged one is excluded.
-        """
-        say, start, word, count = self.monitor.say, time.monotonic(), "uncertainty", self.trials.members
-        base = Original(main, self.reconstructor, self.training, lambda *data: self._projections(main, *data), self.rig)
-        deviations = BootstrapDeviations(quantities[0], gas, base)
-        diverged = []
-        for number in range(1, count + 1):
-            member = self.trials.member(number, base)
-            settings = self.budget.allot(member.reconstructor, 1 / (count - number + 1))
-            run = CheckpointedRun(
-                self.out.member(number), settings, member.measurement, self.start, self.checkpoint_every, self.monitor,
-            )  # fmt: skip
-            result = run(f"trial {number} of {count}")
-            if result.outcome.reason == "interrupted":
-                say(f"{word}: interrupted after {number - 1} of {count} trials; continue with --resume")
-                break
-            if result.outcome.failed:
-                say(f"{word}: trial {number} {result.outcome.reason} and is excluded: {result.outcome.message}")
-                diverged.append(number)
-                continue
-            deviations.add_trial(member, result)
-        if not deviations.count:
-            say(f"{word}: no trial succeeded, so no standard deviation is written")
-            return
-        entries: dict[str, Any] = {"kind": self.trials.kind, "source": "bootstrap", "diverged_trials": diverged}
-        entries["seconds"] = time.monotonic() - start
-        write_deviations(self.out, self.monitor, quantities, deviations, entries)
-
-    def _projections(self, main: Reconstruction, field: Field, measurement: Measurement) -> Maps:
-        with self.monitor.counting("projecting the field") as bar:
+    def projections(field: Field, measurement: Measurement) -> Maps:
+        with monitor.counting("projecting the field") as bar:
             return reproject(field, measurement, (), main.device, bar, main.model).maps
+
+    say, start, diverged = monitor.say, time.monotonic(), []
+    base = Original(main, run.reconstructor, run.inputs.training, projections, so_far.rig)
+    deviations = BootstrapDeviations(so_far.quantities[0], run.settings.gas, base)
+    for number in range(1, count + 1):
+        member, every = run.trials.member(number, base), run.settings.checkpoint_every
+        settings = so_far.budget.limited(member.reconstructor, 1 / (count - number + 1))
+        trial = CheckpointedRun(run.out.member(number), settings, member.measurement, run.start, every, monitor)
+        result = trial(f"trial {number} of {count}")
+        if result.outcome.reason == "interrupted":
+            say(f"uncertainty: interrupted after {number - 1} of {count} trials; continue with --resume")
+            break
+        if result.outcome.failed:
+            say(f"uncertainty: trial {number} {result.outcome.reason} and is excluded: {result.outcome.message}")
+            diverged.append(number)
+            continue
+        deviations.add_trial(member, result)
+    if not deviations.count:
+        say("uncertainty: no trial succeeded, so no standard deviation is written")
+        return so_far
+    entries: dict[str, Any] = {"kind": run.trials.kind, "source": "bootstrap", "diverged_trials": diverged}
+    entries["seconds"] = time.monotonic() - start
+    write_deviations(run.out, monitor, so_far.quantities, deviations, entries)
+    return so_far

@@ -21,7 +21,7 @@ from nerif.reconstruction.reconstructor import Reconstructor
 from nerif.reconstruction.shared_settings import SHORT_RUN
 from nerif.reconstruction.voxels.voxel_reconstructor import VoxelReconstructor
 
-__all__ = ["NO_LIMIT", "Budget"]
+__all__ = ["Budget"]
 
 REPORT, PER_PIXEL = 2.5, 4e-6  # s: files, verdict and report; scores and images of the views
 LEAST = 0.1  # of the limit, for the fits
@@ -37,29 +37,19 @@ R = TypeVar("R", bound=Reconstructor)
 
 @dataclass(frozen=True)
 class Budget:
-    """A time limit, shared among the fits of a job.
+    """A time limit, shared among the fits of a run."""
 
-    Parameters
-    ----------
-    limit : s; 0: none
-    start : time from which it counts, s since the epoch
-    reserve : s, for what follows the fits
-    steps, pace : of the main fit, that are enough, and s per step; 0 if unknown
-    words : name of these steps, and what the pace follows from
-    projection : s, to project a network into the views
-    """
-
-    limit: float
-    start: float
-    reserve: float
-    steps: int = 0
-    pace: float = 0.0
-    words: tuple[str, str] = TRAINING
-    projection: float = 0.0
+    limit: float  #: s; 0: none
+    start: float  #: time from which it counts, s since the epoch
+    reserve: float  #: s, for what follows the fits
+    steps: int = 0  #: of the main fit, that are enough; 0 if unknown
+    pace: float = 0.0  #: s per step; 0 if unknown
+    words: tuple[str, str] = TRAINING  #: name of these steps, and what the pace follows from
+    projection: float = 0.0  #: s, to project a network into the views
 
     @classmethod
     def of(cls, reconstructor: Reconstructor, measurement: Measurement, voxels: int, start: float | None) -> Budget:
-        """Return the budget of a job; the time to evaluate its field is measured on this machine.
+        """Return the budget of a run; the time to evaluate its field is measured on this machine.
 
         Parameters
         ----------
@@ -84,7 +74,7 @@ class Budget:
         steps = min(reconstructor.first_cycle, reconstructor.max_steps or reconstructor.first_cycle)
         return cls(limit, start, reserve, steps, STEP * each * reconstructor.points_per_batch, TRAINING, projection)
 
-    def holding(self, seconds: float) -> Budget:
+    def with_reserve(self, seconds: float) -> Budget:
         """Return the budget with more time in reserve."""
         return dataclasses.replace(self, reserve=self.reserve + seconds) if self.limit else self
 
@@ -98,7 +88,7 @@ class Budget:
         """Whether the limit has passed."""
         return bool(self.limit) and time.time() > self.start + self.limit
 
-    def allot(self, reconstructor: R, share: float = 1.0) -> R:
+    def limited(self, reconstructor: R, share: float = 1.0) -> R:
         """Return settings with a share of the time that is left for fits; unchanged without a limit."""
         if not self.limit:
             return reconstructor
@@ -118,7 +108,7 @@ class Budget:
         """
         if not self.limit:
             return ""
-        budget, fits = self.holding(self.projection * validated), 1 + trials + SHORT_RUN * validated
+        budget, fits = self.with_reserve(self.projection * validated), 1 + trials + SHORT_RUN * validated
         seconds, rest, required = budget._for_fits / fits, self.limit - budget.left, self.steps * self.pace
         if budget.left >= LITTLE * self.limit and seconds >= FEW * required:
             return ""
@@ -129,9 +119,6 @@ class Budget:
             text += f", about {seconds / self.pace:.0f} {name}; {self.steps} take {duration(required)}, by {basis}"
         enough = rest + max(fits * required, rest)  # at least half of it for the fits
         return f"{text}. Give --time-limit {math.ceil(enough / 10) * 10} or more"
-
-
-NO_LIMIT = Budget(0.0, 0.0, 0.0)
 
 
 def _evaluation(settings: TrainingSettings, measurement: Measurement) -> tuple[float, float]:

@@ -22,28 +22,16 @@ INPUTS = "inputs.json"
 
 @dataclass(frozen=True)
 class CheckpointedRun:
-    """A reconstruction and its directory; content of other settings or data is replaced.
+    """A reconstruction and its directory; content of other settings or data is replaced."""
 
-    Parameters
-    ----------
-    directory : of its own
-    reconstructor : settings
-    data : to reconstruct from
-    start : initial field, or None
-    checkpoint_every : s
-    monitor : of the progress
-    restart : whether to ignore the content of the directory
-    limits : names of settings that may differ when a run is resumed, beside the time limit
-    """
-
-    directory: ResultDirectory
-    reconstructor: Reconstructor
-    data: Measurement
-    start: Field | None = None
-    checkpoint_every: float = 60.0
-    monitor: Monitor = QUIET
-    restart: bool = False
-    limits: tuple[str, ...] = ()
+    directory: ResultDirectory  #: of its own
+    reconstructor: Reconstructor  #: settings
+    data: Measurement  #: to reconstruct from
+    start: Field | None = None  #: initial field, or None
+    checkpoint_every: float = 60.0  #: s
+    monitor: Monitor = QUIET  #: of the progress
+    restart: bool = False  #: whether to ignore the content of the directory
+    limits: tuple[str, ...] = ()  #: names of settings that may differ when a run is resumed, beside the time limit
 
     @property
     def resumable(self) -> bool:
@@ -65,7 +53,8 @@ class CheckpointedRun:
                 self.monitor.say(f"{error}; {title} is repeated")
         with self.monitor.training(title) as progress:
             checkpoint = checkpoints(self.directory.path, self.checkpoint_every)
-            on_step = compose(*callbacks, self._write_inputs(state is not None), progress, checkpoint)
+            begin = [self._begin] if state is None else []
+            on_step = compose(*callbacks, *begin, progress, checkpoint)
             result = self.reconstructor(self.data, on_step, state, self.start if state is None else None)
         if result.outcome.reason == "interrupted":
             if result.state is not None:
@@ -85,20 +74,14 @@ class CheckpointedRun:
             field, box, n_ambient, [], outcome, settings, quantity=quantity, rig=self.directory.rig(), bodies=bodies
         )
 
-    def _write_inputs(self, resumed: bool) -> OnStep:
-        """Return a callback that clears the directory at the first step of a new run and writes its inputs."""
-        pending = not resumed
-
-        def write(step: Step) -> None:
-            nonlocal pending
-            if pending:
-                self.directory.files.remove()
-                self.directory.path.mkdir(parents=True, exist_ok=True)
-                with self.directory.writing(INPUTS) as path, atomic(path) as part:
-                    part.write_text(self._inputs, encoding="utf-8")
-                pending = False
-
-        return write
+    def _begin(self, step: Step) -> None:
+        """Clear the directory at the first step of a new run, and write its inputs."""
+        if not self.directory.begun:
+            self.directory.files.remove()
+            self.directory.path.mkdir(parents=True, exist_ok=True)
+            with self.directory.writing(INPUTS) as path, atomic(path) as part:
+                part.write_text(self._inputs, encoding="utf-8")
+            self.directory.begun = True
 
     @property
     def _inputs(self) -> str:

@@ -61,40 +61,23 @@ def with_halves(
 
 @dataclass(frozen=True)
 class ShortFit:
-    """The field of the short run, and its data with the cameras that it refined.
+    """The field of the short run, and its data with the cameras that it refined."""
 
-    Parameters
-    ----------
-    field : reconstructed
-    training : data of the views that it used
-    withheld : data of the withheld view, its camera refined against the field if the run refined cameras
-    """
-
-    field: Field
-    training: Measurement
-    withheld: Measurement
+    field: Field  #: reconstructed
+    training: Measurement  #: data of the views that it used
+    withheld: Measurement  #: data of the withheld view, its camera refined against the field if the run refined cameras
 
 
 @dataclass(frozen=True)
 class CrossValidation:
-    """The short run without a view, in the result directory.
+    """The short run without a view, in the result directory."""
 
-    Parameters
-    ----------
-    out : the result directory
-    reconstructor : settings of the whole run
-    data : of the whole run
-    checkpoint_every : s
-    monitor : of the progress
-    restart : whether to ignore the content of the directory
-    """
-
-    out: ResultDirectory
-    reconstructor: Reconstructor
-    data: Measurement
-    checkpoint_every: float = 60.0
-    monitor: Monitor = QUIET
-    restart: bool = False
+    out: ResultDirectory  #: the result directory
+    reconstructor: Reconstructor  #: settings of the whole run
+    data: Measurement  #: of the whole run
+    checkpoint_every: float = 60.0  #: s
+    monitor: Monitor = QUIET  #: of the progress
+    restart: bool = False  #: whether to ignore the content of the directory
 
     @property
     def view(self) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from contextlib import nullcontext
 from pathlib import Path
 
 from nerif.data.velocity_sequence import VelocitySequence, open_volumes
@@ -22,10 +23,7 @@ def write_report(directory: str | os.PathLike[str], path: Path | None = None, mo
     with monitor.counting("writing the report"):
         result = out.read()
         page = html.render(result)
-    if path == out / REPORT:
-        with out.writing(REPORT):
-            html.write(page, path)
-    else:
+    with out.writing(REPORT) if path == out / REPORT else nullcontext():
         html.write(page, path)
     for gap in result.missing:
         monitor.say(f"missing: {gap.sentence}")

@@ -1,4 +1,4 @@
-"""Settings of a reconstruction into a directory."""
+"""Settings of a reconstruction into a directory, in addition to those of the method."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from annotated_types import Ge
 from nerif.common.settings import Checked, NonNegative
 from nerif.physics.quantities import GasSettings
 
-__all__ = ["AUTO", "NONE", "Run"]
+__all__ = ["AUTO", "NONE", "Run", "RunSettings"]
 
 AUTO: tuple[str, ...] = ("auto",)
 NONE: tuple[str, ...] = ("none",)
@@ -19,7 +19,7 @@ NONE: tuple[str, ...] = ("none",)
 
 
 @dataclass(frozen=True)
-class Run(Checked):
+class RunSettings(Checked):
     """Settings of a reconstruction into a directory, in addition to those of the method."""
 
     withhold: tuple[str, ...] = AUTO
@@ -47,3 +47,6 @@ class Run(Checked):
     same result to the last digit."""
     gas: GasSettings = field(default_factory=GasSettings)
     """Gas for density and temperature."""
+
+
+Run = RunSettings  #: the name of the class in earlier versions

@@ -16,8 +16,9 @@ import time
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import nullcontext
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -25,7 +26,7 @@ import numpy as np
 import psutil
 import pytest
 
-from sequence_films import COLD, QUICK, blank, simulated
+from sequence_films import COLD, QUICK, blank
 
 pytest.importorskip("distributed", reason="pip install '.[sequence]'")
 
@@ -34,9 +35,10 @@ from nerif.cli.cli import main
 from nerif.common.conventions import InputError
 from nerif.common.locks import locked
 from nerif.data.measurement_sequence import MeasurementSequence
-from nerif.workflow.sequence import cluster
+from nerif.geometry import Grid
+from nerif.workflow.sequence import cluster, run
 from nerif.workflow.sequence.cluster import _gpus, check_workers, open_cluster, read_slurm, slurm_cluster
-from nerif.workflow.sequence.plan import SequenceSettings
+from nerif.workflow.sequence.plan import SequencePlan, SequenceSettings
 from nerif.workflow.sequence.reconstruct_sequence import reconstruct_sequence
 from nerif.workflow.sequence.store import DONE, FAILED, MISSING, SequenceStore
 from refusals import refused
@@ -230,52 +232,25 @@ def test_an_interruption_keeps_complete_frames_and_states_how_to_continue(film, 
 
 
 @pytest.mark.slow
-def test_memory_of_the_command_and_of_each_worker_stays_flat_over_500_frames(tmp_path, capsys):
-    film, out = simulated(tmp_path / "long.zarr", 500), tmp_path / "out.zarr"
-    process = subprocess.Popen(command(film, out, "--chunk", "25"), stdout=subprocess.DEVNULL)
-    memory: dict[int, list[tuple[int, int]]] = {}  # (frames, bytes) by process
-    while process.poll() is None:
-        with suppress(psutil.NoSuchProcess):
-            frames = int((status_of(out) != MISSING).sum())
-            for each in (psutil.Process(process.pid), *workers_of(process)):
-                memory.setdefault(each.pid, []).append((frames, each.memory_info().rss))
-        time.sleep(0.1)
-    assert process.returncode == 0
-    assert (status_of(out) == DONE).all()
-    assert len(memory) == 3
-    for pid, samples in memory.items():
-        early, late = (
-            np.median([rss for frames, rss in samples if low <= frames < low + 100]) / 2**20 for low in (100, 400)
-        )
-        name = "command" if pid == process.pid else "worker"
-        with capsys.disabled():
-            print(f"\n{name}: {early:.1f} MiB at frames 100 to 200, {late:.1f} MiB at frames 400 to 500", end="")
-        assert late < 1.05 * early, name
-
-
-@pytest.mark.slow
 def test_a_frame_whose_worker_dies_three_times_is_recorded(film, tmp_path, monkeypatch):
-    from nerif.workflow.sequence import run
-    from nerif.workflow.sequence.run import run_sequence
-
     plan = _plan(film, tmp_path / "out.zarr", 6)
     deadly = tmp_path / "deadly.py"
     monkeypatch.syspath_prepend(tmp_path)  # workers get it
     deadly.write_text(
         "import os\nfrom nerif.workflow.sequence.run import _in_worker as real\n"
-        "from nerif.workflow.sequence import frames\n"
-        "before = frames._frame\n"
+        "from nerif.workflow.sequence import chunk\n"
+        "before = chunk._frame\n"
         "def _frame(plan, settings, measurement, *rest):\n"
         "    if abs(float(measurement.displacement.abs().sum()) - TOTAL) < 1e-6 * TOTAL:\n        os._exit(9)\n"
         "    return before(plan, settings, measurement, *rest)\n"
-        "def work(plan, first, last, topic):\n    frames._frame = _frame\n    real(plan, first, last, topic)\n"
+        "def work(plan, first, last, topic):\n    chunk._frame = _frame\n    real(plan, first, last, topic)\n"
     )
     total = float(MeasurementSequence.read(film).frame(7).displacement.abs().sum())
     deadly.write_text(f"TOTAL = {total!r}\n" + deadly.read_text())
     module = importlib.import_module("deadly")
     monkeypatch.setattr(run, "_in_worker", module.work)
     with open_cluster("local", 2) as (client, _):
-        progress = run_sequence(client, plan)
+        progress = run.run_sequence(client, plan)
     store = SequenceStore(plan.out)
     assert np.flatnonzero(store.status == FAILED).tolist() == [7]
     assert (store.status == DONE).sum() == 23
@@ -283,60 +258,53 @@ def test_a_frame_whose_worker_dies_three_times_is_recorded(film, tmp_path, monke
     assert (progress.done, progress.failed) == (23, 1)
 
 
-@pytest.mark.slow
-def test_a_chunk_whose_work_raises_fails_with_the_reason_and_the_rest_goes_on(five, tmp_path, monkeypatch):
+def raising(real, plan, first, last, event):
+    real(plan, first, min(last, 1), event)
+    if first == 0:
+        raise KeyError("layer 7")
+    real(plan, first, last, event)
+
+
+def dying(real, plan, first, last, event):
+    from distributed import KilledWorker
+
+    if first == 0:
+        raise KilledWorker("frames", SimpleNamespace(address=""), 0)
+    real(plan, first, last, event)
+
+
+def filling(*_):
+    raise OSError(errno.ENOSPC, "no space")
+
+
+@pytest.mark.parametrize(
+    ("work", "workers", "status", "loss"),
+    [
+        pytest.param(raising, 1, [DONE, FAILED, FAILED, DONE, DONE], "", marks=pytest.mark.slow),
+        (dying, 1, [MISSING] * 3 + [DONE] * 2, "workers died 10 times; "),  # before they begin a frame
+        (filling, 1, [MISSING] * 5, None),  # fails no frame
+        (raising, 0, [MISSING] * 5, "workers died 0 times; ended, since no worker is left"),
+    ],
+)
+def test_a_run_whose_chunks_or_workers_fail(five, tmp_path, monkeypatch, work, workers, status, loss):
     from distributed import Client
-
-    from nerif.workflow.sequence import run
-
-    plan, real = _plan(five, tmp_path / "out.zarr", 3), run.reconstruct_frames
-
-    def work(plan, first, last, event):
-        real(plan, first, min(last, 1), event)
-        if first == 0:
-            raise KeyError("layer 7")
-        real(plan, first, last, event)
-
-    monkeypatch.setattr(run, "reconstruct_frames", work)
-    with Client(processes=False, n_workers=1, threads_per_worker=1, dashboard_address=None) as client:
-        progress = run.run_sequence(client, plan)
-    store = SequenceStore(plan.out)
-    assert store.status.tolist() == [DONE, FAILED, FAILED, DONE, DONE]
-    assert store.reasons[1] == "KeyError: 'layer 7'"
-    assert (progress.done, progress.failed) == (3, 2)
-
-
-def test_workers_that_die_before_they_begin_end_the_run(five, tmp_path, monkeypatch):
-    from distributed import Client, KilledWorker
-
-    from nerif.workflow.sequence import run
-
-    def work(plan, first, last, event):
-        if first == 0:
-            raise KilledWorker("frames", SimpleNamespace(address=""), 0)
-        real(plan, first, last, event)
-
-    plan, real = _plan(five, tmp_path / "out.zarr", 3), run.reconstruct_frames
-    monkeypatch.setattr(run, "reconstruct_frames", work)
-    with Client(processes=False, n_workers=1, threads_per_worker=1, dashboard_address=None) as client:
-        progress = run.run_sequence(client, plan)
-    assert SequenceStore(plan.out).status.tolist() == [MISSING] * 3 + [DONE] * 2
-    assert (progress.done, progress.failed, progress.deaths) == (2, 0, run.MOST_UNBEGUN)
-    assert progress.loss.startswith("workers died 10 times; ")
-
-
-def test_a_run_without_workers_ends(five, tmp_path, monkeypatch):
-    from distributed import Client
-
-    from nerif.workflow.sequence import run
 
     plan = _plan(five, tmp_path / "out.zarr", 3)
-    for name in ("LOOK_EVERY", "WITHOUT_WORKERS"):
+    monkeypatch.setattr(run, "reconstruct_frames", partial(work, run.reconstruct_frames))
+    for name in ("LOOK_EVERY", "WITHOUT_WORKERS") if not workers else ():
         monkeypatch.setattr(run, name, 0.1)
-    with Client(processes=False, n_workers=0, dashboard_address=None) as client:
-        progress = run.run_sequence(client, plan)
-    assert (SequenceStore(plan.out).status == MISSING).all()
-    assert "no worker is left" in progress.loss
+    with Client(processes=False, n_workers=workers, threads_per_worker=1, dashboard_address=None) as client:
+        if loss is None:
+            with pytest.raises(OSError) as error:
+                run.run_sequence(client, plan)
+            assert error.value.errno == errno.ENOSPC
+        else:
+            progress = run.run_sequence(client, plan)
+            assert (progress.done, progress.failed) == (status.count(DONE), status.count(FAILED))
+            assert progress.loss.startswith(loss)
+    store = SequenceStore(plan.out)
+    assert store.status.tolist() == status
+    assert {*store.reasons} <= {"", "KeyError: 'layer 7'"}
 
 
 @pytest.mark.parametrize(
@@ -349,29 +317,7 @@ def test_a_command_that_leaves_frames_missing_fails(five, monkeypatch, status, c
     assert main(["sequence", str(five), "-o", "r.zarr"]) == code
 
 
-def test_a_full_disk_fails_no_frame(five, tmp_path, monkeypatch):
-    from distributed import Client
-
-    from nerif.workflow.sequence import run
-
-    def work(*_):
-        raise OSError(errno.ENOSPC, "no space")
-
-    plan = _plan(five, tmp_path / "out.zarr", 3)
-    monkeypatch.setattr(run, "reconstruct_frames", work)
-    with (
-        Client(processes=False, n_workers=1, threads_per_worker=1, dashboard_address=None) as client,
-        pytest.raises(OSError) as error,
-    ):
-        run.run_sequence(client, plan)
-    assert error.value.errno == errno.ENOSPC
-    assert (SequenceStore(plan.out).status == MISSING).all()
-
-
-def _plan(film: Path, out: Path, chunk: int):
-    from nerif.geometry import Grid
-    from nerif.workflow.sequence.plan import SequencePlan
-
+def _plan(film: Path, out: Path, chunk: int) -> SequencePlan:
     sequence = MeasurementSequence.read(film)
     grid = Grid.of_resolution(sequence.fullest().box, 10)
     SequenceStore.begin(out, sequence, grid, ("index_excess",), COLD.network, {})
@@ -391,28 +337,17 @@ def test_a_scheduler_that_is_there_already_is_used(five, tmp_path):
     assert (status_of(out) == DONE).all()
 
 
-class Workers:
-    """A client whose workers answer so."""
+@pytest.mark.parametrize("answer", [__version__, "9.9", ModuleNotFoundError("No module named 'nerif'")], ids=str)
+def test_workers_that_could_not_read_the_job_are_refused(answer):
+    def ask(function, words):
+        if isinstance(answer, Exception):
+            raise answer
+        assert function(words) == __version__  # the expression makes sense here
+        return {"tcp://node7": answer}
 
-    def __init__(self, answer: str | Exception) -> None:
-        self.answer = answer
-
-    def wait_for_workers(self, count: int) -> None:
-        assert count == 1
-
-    def run(self, function, words):
-        if isinstance(self.answer, Exception):
-            raise self.answer
-        assert function(words) == __version__  # what is asked makes sense here
-        return {"tcp://node7": self.answer}
-
-
-def test_workers_that_could_not_read_the_job_are_refused():
-    check_workers(Workers(__version__))
-    with refused("cluster"):
-        check_workers(Workers("9.9"))
-    with refused("cluster"):
-        check_workers(Workers(ModuleNotFoundError("No module named 'nerif'")))
+    client = SimpleNamespace(run=ask, wait_for_workers=lambda count: None)
+    with nullcontext() if answer == __version__ else refused("cluster"):
+        check_workers(client)
 
 
 SLURM = """
@@ -458,10 +393,6 @@ def test_the_job_script_of_slurm_asks_for_what_the_file_says(tmp_path, monkeypat
     file = tmp_path / "slurm.yaml"
     file.write_text(SLURM)
     assert read_slurm(file)["cores"] == 1  # one chunk at a time in a job
-    file.write_text(SLURM.replace("jobs: 4", "jobs: 0"))
-    with pytest.raises(InputError, match="jobs: expected"), slurm_cluster(file):
-        pass
-    file.write_text(SLURM)
     commands(tmp_path, monkeypatch, "echo Submitted batch job $$; echo x >> $0.log")
     with slurm_cluster(file, tmp_path) as jobs:
         script = jobs.job_script()
@@ -487,33 +418,33 @@ def test_the_job_script_of_slurm_asks_for_what_the_file_says(tmp_path, monkeypat
     assert [line for line in script.splitlines() if line in prologue] == prologue
 
 
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("cores: [", "not a YAML file"),
-        ("- 1", "expected names and values"),
-        ("cores: 1\nmemory: 1GB\njob_script_prologue: module load x", "expected e.g. .'source ~.*got 'module load x'"),
-        ("cores: 1\nmemory: 1GB\njob_extra_directives: --gres=gpu:1", "job_extra_directives: expected e.g. "),
-        ("cores: 1\nmemory: 1GB\njob_extra_directives: [1]", "job_extra_directives: expected e.g. "),
-        ("cores: [8]\nmemory: 1GB", r"cores: expected e.g. 8, got \[8\]"),
-        ("cores: 1.5\nmemory: 1GB", "cores: expected e.g. 8, got 1.5"),
-        ("cores: true\nmemory: 1GB", "cores: expected e.g. 8, got True"),
-        ("cores: 1\nmemory: [1GB]", "memory: expected e.g. '32GB'"),
-        ("cores: 1\nmemory: 1GB\nprocesses: {a: 1}", "processes: expected e.g. 1"),
-        ("cores: 1\nmemory: 1GB\njobs: [4]", "jobs: expected e.g. 4"),
-        ("cores: 1\nmemory: 1GB\nqueue: [gpu]", "queue: expected a text or a number"),
-        ("cores: 1\nmemory: 1GB\nwalltime: 10:00:00", "walltime: expected e.g. '02:00:00', got 36000"),
-        ("cores: 1\nmemory: much", "memory: Could not interpret 'much'"),
-        ("cores: 4", "expected 'memory' of a job"),
-        ("cores: 1\nmemory: 1GB\nscheduler_options: eth0", "scheduler_options: expected e.g. {'host': '10.0.0.1'}"),
-        ("cores: 4\nmemory: 8GB\nqueu: x", "unknown key 'queu'; the nearest known one is 'queue'"),
-    ],
-)
-def test_a_file_that_is_no_slurm_is_refused(text, words, tmp_path):
+NO_SLURM = {
+    "cores: [": "not a YAML file",
+    "- 1": "expected names and values",
+    "cores: 1\nmemory: 1GB\njob_script_prologue: module load x": "expected e.g. .'source ~.*got 'module load x'",
+    "cores: 1\nmemory: 1GB\njob_extra_directives: --gres=gpu:1": "job_extra_directives: expected e.g. ",
+    "cores: 1\nmemory: 1GB\njob_extra_directives: [1]": "job_extra_directives: expected e.g. ",
+    "cores: [8]\nmemory: 1GB": r"cores: expected e.g. 8, got \[8\]",
+    "cores: 1.5\nmemory: 1GB": "cores: expected e.g. 8, got 1.5",
+    "cores: true\nmemory: 1GB": "cores: expected e.g. 8, got True",
+    "cores: 1\nmemory: [1GB]": "memory: expected e.g. '32GB'",
+    "cores: 1\nmemory: 1GB\nprocesses: {a: 1}": "processes: expected e.g. 1",
+    "cores: 1\nmemory: 1GB\njobs: 0": "jobs: expected e.g. 4",
+    "cores: 1\nmemory: 1GB\nqueue: [gpu]": "queue: expected a text or a number",
+    "cores: 1\nmemory: 1GB\nwalltime: 10:00:00": "walltime: expected e.g. '02:00:00', got 36000",
+    "cores: 1\nmemory: much": "memory: Could not interpret 'much'",
+    "cores: 4": "expected 'memory' of a job",
+    "cores: 1\nmemory: 1GB\nscheduler_options: eth0": "scheduler_options: expected e.g. {'host': '10.0.0.1'}",
+    "cores: 4\nmemory: 8GB\nqueu: x": "unknown key 'queu'; the nearest known one is 'queue'",
+}
+
+
+def test_a_file_that_is_no_slurm_is_refused(tmp_path):
     file = tmp_path / "slurm.yaml"
-    file.write_text(text)
-    with pytest.raises(InputError, match=words), slurm_cluster(file):
-        pass
+    for text, words in NO_SLURM.items():
+        file.write_text(text)
+        with pytest.raises(InputError, match=words), slurm_cluster(file):
+            pass
 
 
 @pytest.mark.slow
@@ -542,16 +473,13 @@ def test_invalid_options(arguments, words, five, tmp_path, capsys, monkeypatch):
     assert "cluster" in words or not list(tmp_path.iterdir())
 
 
-def test_a_store_that_another_run_writes_is_left_alone(five, tmp_path, capsys):
-    with locked(tmp_path / "o.zarr"):
-        assert main(["sequence", str(five), "-o", str(tmp_path / "o.zarr"), *QUICK, "--force"]) == 2
-    assert "another run writes to it" in capsys.readouterr().err
-    assert not (tmp_path / "o.zarr").exists()
-
-
-def test_a_store_begun_with_other_settings_is_left_alone(five, tmp_path, capsys):
+def test_a_store_of_another_run_or_of_other_settings_is_left_alone(five, tmp_path, capsys):
     out = tmp_path / "o.zarr"
     arguments = ["sequence", str(five), "-o", str(out), *QUICK, "--cluster", "nowhere.yaml"]
+    with locked(out):
+        assert main([*arguments, "--force"]) == 2
+    assert "another run writes to it" in capsys.readouterr().err
+    assert not out.exists()
     assert main(arguments) == 2  # the store is there now
     capsys.readouterr()
     assert main([*arguments, "--seed", "4"]) == 2

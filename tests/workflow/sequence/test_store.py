@@ -23,8 +23,8 @@ from nerif.data.volume_sequence import VolumeSequence
 from nerif.fields.network import Network, NeuralField
 from nerif.fields.phantoms import Flame
 from nerif.geometry import Box, Grid, Ring
-from nerif.report.movie import Movie
 from nerif.report.sequence_page import render_sequence
+from nerif.report.volume_movie import Movie
 from nerif.simulation.simulation import Simulation
 from nerif.workflow.sequence.chunk import finished_frame
 from nerif.workflow.sequence.plan import SequencePlan, SequenceSettings

@@ -17,7 +17,7 @@ from nerif.app.project.demo_project import RIG
 from nerif.app.project.workspace import Workspace
 from nerif.cli.commands.design import Design
 from nerif.geometry import Camera
-from nerif.simulation.design import Expectation, expect
+from nerif.simulation.rig_design import Expectation, expect
 
 __all__ = ["PAGE"]
 

@@ -27,7 +27,7 @@ from nerif.reconstruction.methods import METHODS
 from nerif.reconstruction.neural.presets import PRESETS, preset
 from nerif.reconstruction.progress import Monitor
 from nerif.results.directory import VOLUME, ResultDirectory
-from nerif.workflow.job import Job
+from nerif.workflow.reconstruction_run import ReconstructionRun
 
 __all__ = ["PAGE"]
 
@@ -62,8 +62,8 @@ def form_of_film(preset_name: str) -> Form[Sequence]:
 
 def prepare(path: Path, out: Path, settings: Reconstruct, say: Callable[[str], None]) -> None:
     """Check the input of a run, which writes nothing, and say what the run would say at its start."""
-    voxels, monitor = getattr(settings, "voxels", None), Monitor(say)
-    Job(ResultDirectory(out), path, settings.reconstructor, settings.run, voxels=voxels, monitor=monitor)
+    directory, voxels = ResultDirectory(out), getattr(settings, "voxels", None)
+    ReconstructionRun.plan(directory, path, settings.reconstructor, settings.run, voxels, monitor=Monitor(say))
 
 
 class ReconstructPage:

@@ -17,8 +17,8 @@ from nerif.common.conventions import InputError
 from nerif.data.velocity_sequence import VelocitySequence, open_volumes
 from nerif.reconstruction.field_files import FIELD
 from nerif.reconstruction.reconstructor import END
-from nerif.report.movie import finished_frames
 from nerif.report.summary import accuracy_rows
+from nerif.report.volume_movie import finished_frames
 from nerif.results.directory import LIVE, METRICS, RUN, VOLUME, Result, ResultDirectory
 from nerif.results.metrics_file import Metrics
 

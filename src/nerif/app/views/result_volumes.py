@@ -14,8 +14,8 @@ from nerif.data.volume import Volume
 from nerif.data.volume_file import read_volumes
 from nerif.plotting.drawing import colour_range, plotted_values
 from nerif.report.isosurface import default_level
-from nerif.report.movie import finished_frames, ranges_over_time
 from nerif.report.packing import coarsen
+from nerif.report.volume_movie import finished_frames, ranges_over_time
 from nerif.results.directory import VOLUME
 
 __all__ = ["FilmVolumes", "ResultVolumes", "Source", "film_progress", "source_of"]

@@ -11,7 +11,7 @@ from nerif.cli.output import say
 from nerif.cli.settings import Settings, command
 from nerif.common.settings import Flat
 from nerif.geometry.rig import Ring
-from nerif.simulation.design import DesignSettings, Expectation, expect
+from nerif.simulation.rig_design import DesignSettings, Expectation, expect
 
 __all__ = ["Design", "main", "run"]
 

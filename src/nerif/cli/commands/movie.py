@@ -33,7 +33,7 @@ class MovieCommand(Settings):
 def run(settings: MovieCommand) -> None:
     """Write the movie."""
     from nerif.data.velocity_sequence import open_volumes
-    from nerif.report.movie import Movie, finished_frames
+    from nerif.report.volume_movie import Movie, finished_frames
 
     check_output(settings.out, settings.force)
     store = open_volumes(settings.result)

@@ -22,7 +22,7 @@ from nerif.reconstruction.methods import METHODS
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.neural.presets import PRESETS, preset
 from nerif.reconstruction.reconstructor import OnStep, Reconstruction, Reconstructor, Step
-from nerif.workflow.run_settings import Run
+from nerif.workflow.run_settings import RunSettings
 
 __all__ = ["Reconstruct", "ReconstructNeRIF", "command_of", "main", "run"]
 
@@ -50,7 +50,7 @@ class Reconstruct(Settings):
     """Write TensorBoard scalars to OUT/tensorboard."""
     live: bool = False
     """Write OUT/live.json and OUT/live.npz during the run, for nerif app."""
-    run: Annotated[Run, Flat] = field(default_factory=Run)
+    run: Annotated[RunSettings, Flat] = field(default_factory=RunSettings)
     reconstructor: Annotated[Reconstructor, NoOption] = field(default_factory=NeRIF)
 
 

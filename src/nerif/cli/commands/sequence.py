@@ -20,7 +20,7 @@ from nerif.workflow.sequence.plan import SequenceSettings
 
 if TYPE_CHECKING:
     from nerif.workflow.sequence import store
-    from nerif.workflow.sequence.run import Progress
+    from nerif.workflow.sequence.run import SequenceProgress
 
 __all__ = ["Sequence", "main", "run"]
 
@@ -69,7 +69,7 @@ def run(settings: Sequence) -> store.SequenceStore:
         velocity.check(settings.velocity, settings.out, settings.frames.quantities, settings.force)
     with figures_bar("frames") as bar:
 
-        def update(progress: Progress) -> None:
+        def update(progress: SequenceProgress) -> None:
             figures = f"{progress.settled}/{progress.total} | {progress.frames_per_minute:.1f} frames/min"
             figures += f" | {progress.failed} failed"
             figures += f" | {progress.deaths} deaths of workers" * bool(progress.deaths)

@@ -28,18 +28,11 @@ REACH = 5.0  # standard deviations at which a Gaussian is truncated
 
 @dataclass(frozen=True)
 class Particles:
-    """Particles in an illuminated box.
+    """Particles in an illuminated box."""
 
-    Parameters
-    ----------
-    positions : mm, world frame
-    brightness : integral over the emission of each, mm^2
-    box : mm
-    """
-
-    positions: Float[Tensor, "n 3"]
-    brightness: Float[Tensor, " n"]
-    box: Box
+    positions: Float[Tensor, "n 3"]  #: mm, world frame
+    brightness: Float[Tensor, " n"]  #: integral over the emission of each, mm^2
+    box: Box  #: mm
 
     def __len__(self) -> int:
         return len(self.positions)

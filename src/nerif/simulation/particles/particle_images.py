@@ -26,12 +26,8 @@ STEP = 1e-3  # mm, of the difference quotient for the scale of an image
 
 
 def images(
-    particles: Particles,
-    cameras: Sequence[Camera],
-    counts: float = 1000.0,
-    diameter: float = DIAMETER,
-    seed: int = 0,
-) -> Measurement:
+    particles: Particles, cameras: Sequence[Camera], counts: float = 1000.0, diameter: float = DIAMETER, seed: int = 0,
+) -> Measurement:  # fmt: skip
     """Return the images of particles as a measurement of emission in their box.
 
     Parameters

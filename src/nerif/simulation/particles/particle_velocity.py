@@ -18,23 +18,16 @@ from nerif.data.volume import COMPONENTS, Volume
 from nerif.geometry import Box, Grid
 from nerif.imaging.displacement.correlation import correlate
 
-__all__ = ["Velocity", "velocity_between", "write_velocities"]
+__all__ = ["VelocityVectors", "velocity_between", "write_velocities"]
 
 
 @dataclass(frozen=True)
-class Velocity:
-    """Displacement of particles at the nodes of a grid over a time.
+class VelocityVectors:
+    """Displacement of particles at the nodes of a grid over a time."""
 
-    Parameters
-    ----------
-    points : nodes, the centres of the windows, mm
-    displacement : along x, y, z, mm; NaN where not valid
-    seconds : between the two instants
-    """
-
-    points: Float[Tensor, "z y x 3"]
-    displacement: Float[Tensor, "z y x 3"]
-    seconds: float
+    points: Float[Tensor, "z y x 3"]  #: nodes, the centres of the windows, mm
+    displacement: Float[Tensor, "z y x 3"]  #: along x, y, z, mm; NaN where not valid
+    seconds: float  #: between the two instants
 
     @property
     def values(self) -> Float[Tensor, "z y x 3"]:
@@ -65,7 +58,9 @@ class Velocity:
         return float(difference.square().mean().sqrt())
 
 
-def velocity_between(first: Volume, second: Volume, seconds: float, window: int = 32, passes: int = 4) -> Velocity:
+def velocity_between(
+    first: Volume, second: Volume, seconds: float, window: int = 32, passes: int = 4
+) -> VelocityVectors:
     """Return the velocity of particles in two volumes halfway between their instants, to second order in time.
 
     Parameters
@@ -93,11 +88,11 @@ def velocity_between(first: Volume, second: Volume, seconds: float, window: int 
     axes = torch.meshgrid(*(torch.from_numpy(a) for a in vectors.axes), indexing="ij")
     lower = torch.tensor(grid.box.lower, dtype=torch.float64)
     points = lower + (torch.stack(axes[::-1], dim=-1) + 0.5) * spacing
-    return Velocity(points, movement * spacing, float(seconds))
+    return VelocityVectors(points, movement * spacing, float(seconds))
 
 
 def write_velocities(
-    path: str | os.PathLike[str], velocities: Sequence[Velocity], times: Sequence[float], force: bool = False
+    path: str | os.PathLike[str], velocities: Sequence[VelocityVectors], times: Sequence[float], force: bool = False
 ) -> VelocitySequence:
     """Write velocities over time to a store (.zarr), which movies, exports and the app show.
 

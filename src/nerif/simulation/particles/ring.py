@@ -38,20 +38,12 @@ NEAR = 1e-2  # core radii, below which q(s) / s^3 is replaced by its limit
 
 @dataclass(frozen=True)
 class VortexRing:
-    """A stationary vortex ring around the z-axis with velocity along +z in its middle.
+    """A stationary vortex ring around the z-axis with velocity along +z in its middle."""
 
-    Parameters
-    ----------
-    radius : of the circle, mm
-    core : standard deviation of the vorticity around it, mm
-    circulation : Gamma, mm^2/s
-    centre : mm
-    """
-
-    radius: Length
-    core: Length
-    circulation: float
-    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    radius: Length  #: of the circle, mm
+    core: Length  #: standard deviation of the vorticity around it, mm
+    circulation: float  #: Gamma, mm^2/s
+    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)  #: mm
 
     def __post_init__(self) -> None:
         check_settings(self)

@@ -39,7 +39,7 @@ JOB_PROLOGUE = [
     "export PYTHONSAFEPATH=1",  # no imports from the folder of a job; SLURM may not pass the environment on
     "export DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED=False",
     'export DASK_DISTRIBUTED__WORKER__HTTP__ROUTES="[]"',
-    'export DASK_TEMPORARY_DIRECTORY="$(mktemp -d)"',  # see _private_directory
+    'export DASK_TEMPORARY_DIRECTORY="$(mktemp -d)"',  # as in open_cluster
     "trap 'rm -rf \"$DASK_TEMPORARY_DIRECTORY\"' EXIT",
 ]
 """Shell lines of a job, which does not inherit the configuration of the command."""
@@ -93,7 +93,9 @@ def open_cluster(
     if dashboard and importlib.util.find_spec("bokeh") is None:
         raise InputError(f"Bokeh is not installed; {install('sequence')}", field="dashboard")
     settings = DASK_SETTINGS if dashboard else DASK_SETTINGS | NO_HTTP
-    with _private_directory() as scratch, dask.config.set({**settings, **scratch}):
+    # no other user can write to this directory, as Dask puts it on sys.path; its default has a fixed name
+    private = tempfile.TemporaryDirectory(prefix="nerif-", ignore_cleanup_errors=True)
+    with private as scratch, dask.config.set({**settings, "temporary-directory": scratch}):
         if where == "local":
             count = workers or torch.cuda.device_count() or max(1, _cores() // 2)
             cluster, threads = _local_cluster(count, dashboard), max(1, _cores() // count)
@@ -101,16 +103,6 @@ def open_cluster(
             cluster, threads = slurm_cluster(Path(where), shared, dashboard), 0
         with cluster as running, Client(running) as client:
             yield client, threads
-
-
-@contextmanager
-def _private_directory() -> Iterator[dict[str, str]]:
-    """Give Dask a scratch directory that no other user can write to, since it is put on sys.path.
-
-    The default has a fixed name in the temporary directory, where another user may have made it.
-    """
-    with tempfile.TemporaryDirectory(prefix="nerif-", ignore_cleanup_errors=True) as scratch:
-        yield {"temporary-directory": scratch}
 
 
 def _certificate() -> Security:

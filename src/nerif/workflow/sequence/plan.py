@@ -20,8 +20,7 @@ __all__ = ["Event", "SequencePlan", "SequenceSettings"]
 
 MAX_WARM_UP = 10  # steps over which the learning rate rises in a warm start
 
-Event = Callable[[dict[str, object]], None]
-"""Called with {"frame", "what": "begun" | "done" | "failed", ...}."""
+Event = Callable[[dict[str, object]], None]  #: called with {"frame", "what": "begun" | "done" | "failed", ...}
 
 
 @dataclass(frozen=True)
@@ -67,21 +66,13 @@ class SequenceSettings:
 
 @dataclass(frozen=True)
 class SequencePlan:
-    """The reconstruction of a recording into a store.
+    """The reconstruction of a recording into a store."""
 
-    Parameters
-    ----------
-    measurement, out : stores
-    cold : settings of the method
-    settings : of the sequence
-    threads : of a worker on a CPU; 0: its share of the cores
-    """
-
-    measurement: Path
-    out: Path
-    cold: NeRIF
-    settings: SequenceSettings = field(default_factory=SequenceSettings)
-    threads: int = 0
+    measurement: Path  #: store
+    out: Path  #: store
+    cold: NeRIF  #: settings of the method
+    settings: SequenceSettings = field(default_factory=SequenceSettings)  #: of the sequence
+    threads: int = 0  #: of a worker on a CPU; 0: its share of the cores
 
     @property
     def warm(self) -> NeRIF:

@@ -22,27 +22,19 @@ from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.voxels.symmetry_axis import axis_of, symmetry_of, with_axis
 from nerif.workflow.sequence.cluster import check_workers, open_cluster
 from nerif.workflow.sequence.plan import SequencePlan, SequenceSettings
-from nerif.workflow.sequence.run import Progress, outcome_table, run_sequence
+from nerif.workflow.sequence.run import SequenceProgress, outcome_table, run_sequence
 from nerif.workflow.sequence.store import MISSING, SequenceStore
 
 __all__ = ["reconstruct_sequence"]
 
 
 def reconstruct_sequence(
-    out: str | os.PathLike[str],
-    measurement: str | os.PathLike[str],
-    reconstructor: NeRIF,
-    settings: SequenceSettings | None = None,
-    *,
-    cluster: str = "local",
-    workers: int = 0,
-    threads: int = 0,
-    dashboard: bool = False,
-    retry: bool = False,
-    force: bool = False,
-    on_progress: Callable[[Progress], None] = lambda progress: None,
+    out: str | os.PathLike[str], measurement: str | os.PathLike[str], reconstructor: NeRIF,
+    settings: SequenceSettings | None = None, *, cluster: str = "local", workers: int = 0, threads: int = 0,
+    dashboard: bool = False, retry: bool = False, force: bool = False,
+    on_progress: Callable[[SequenceProgress], None] = lambda progress: None,
     say: Callable[[str], None] = lambda line: None,
-) -> SequenceStore:
+) -> SequenceStore:  # fmt: skip
     """Reconstruct every frame of a measurement sequence that a store lacks.
 
     Scripts must call it under `if __name__ == "__main__":`, since local workers are processes that import the script.

@@ -22,31 +22,22 @@ from nerif.workflow.sequence.store import DONE, FAILED, MISSING, SequenceStore
 if TYPE_CHECKING:
     from distributed import Client, Future
 
-__all__ = ["Progress", "chunks_of", "outcome_table", "run_sequence"]
+__all__ = ["SequenceProgress", "chunks_of", "outcome_table", "run_sequence"]
 
 LOOK_EVERY, WITHOUT_WORKERS = 5.0, 60.0  # s, between looks for workers, and before a run without any ends
 MOST_UNBEGUN = 10  # deaths before a chunk has begun a frame; it may be that of another chunk of the same worker
 
 
 @dataclass
-class Progress:
-    """Progress of a run.
+class SequenceProgress:
+    """Progress of a run."""
 
-    Parameters
-    ----------
-    total : frames to reconstruct in this run
-    done, failed : numbers of them
-    deaths : of workers
-    workerless : whether it ended because no worker was left
-    begin : monotonic clock, s
-    """
-
-    total: int
-    done: int = 0
+    total: int  #: frames to reconstruct in this run
+    done: int = 0  #: complete ones
     failed: int = 0
-    deaths: int = 0
-    workerless: bool = False
-    begin: float = field(default_factory=time.monotonic)
+    deaths: int = 0  #: of workers
+    workerless: bool = False  #: whether it ended because no worker was left
+    begin: float = field(default_factory=time.monotonic)  #: monotonic clock, s
 
     @property
     def seconds(self) -> float:
@@ -87,8 +78,8 @@ def chunks_of(missing: Sequence[int], length: int, frames: int) -> list[tuple[in
 
 
 def run_sequence(
-    client: Client, plan: SequencePlan, on_progress: Callable[[Progress], None] = lambda progress: None
-) -> Progress:
+    client: Client, plan: SequencePlan, on_progress: Callable[[SequenceProgress], None] = lambda progress: None
+) -> SequenceProgress:
     """Reconstruct every missing frame of a store, also if workers die or chunks fail.
 
     Frames remain missing if no worker is left, or if the workers of their chunk die before they begin.
@@ -97,7 +88,7 @@ def run_sequence(
 
     store, status = SequenceStore(plan.out), SequenceStore(plan.out).status
     missing = np.flatnonzero(status == MISSING).tolist()
-    progress, topic = Progress(len(missing)), f"nerif-{uuid.uuid4()}"
+    progress, topic = SequenceProgress(len(missing)), f"nerif-{uuid.uuid4()}"
     starts, deaths, unbegun = Counter[int](), Counter[int](), Counter[int]()  # by frame
     chunks: dict[str, tuple[int, int]] = {}  # by the key of their task
 

@@ -39,24 +39,15 @@ MISSING, DONE, FAILED = 0, 1, 2
 
 @dataclass(frozen=True)
 class Frame:
-    """The result of one frame.
+    """The result of one frame."""
 
-    Parameters
-    ----------
-    field : with its weights
-    volumes : to write
-    scores : by view and technique: `name`, `measured`, `cc` and `rms` of re-projection and measurement
-    seconds : duration
-    steps : of training
-    attempts : number
-    """
-
-    field: NeuralField
-    volumes: Sequence[Volume]
+    field: NeuralField  #: with its weights
+    volumes: Sequence[Volume]  #: to write
     scores: Sequence[dict[str, Any]]
-    seconds: float
-    steps: int
-    attempts: int = 1
+    """By view and technique: `name`, `measured`, `cc` and `rms` of re-projection and measurement."""
+    seconds: float  #: duration
+    steps: int  #: of training
+    attempts: int = 1  #: number
 
 
 class SequenceStore(VolumeSequence):
@@ -68,14 +59,9 @@ class SequenceStore(VolumeSequence):
 
     @classmethod
     def begin(
-        cls,
-        path: Path,
-        sequence: MeasurementSequence,
-        grid: Grid,
-        quantities: Sequence[str],
-        network: NetworkShape,
+        cls, path: Path, sequence: MeasurementSequence, grid: Grid, quantities: Sequence[str], network: NetworkShape,
         attributes: dict[str, Any],
-    ) -> SequenceStore:
+    ) -> SequenceStore:  # fmt: skip
         """Make a store without frames, in place of an earlier one.
 
         Parameters

@@ -67,20 +67,17 @@ class Movie(MovieSettings):
             plotter.set_background("white")
             bar = {"title": name, "color": "black", "vertical": True, "fmt": "%.2g", "n_labels": 4}
             bar |= {"position_x": 0.86, "position_y": 0.15, "width": 0.06, "height": 0.5}
-            if vectors is not None and self.style in ("arrows", "streamlines"):
-                lines = _arrows(grid, vectors) if self.style == "arrows" else _streamlines(grid, vectors)
-                if lines.n_points:
-                    plotter.add_mesh(
-                        lines, scalars=name, clim=limits, cmap=COLOUR_MAPS.get(volume.quantity, SEQUENTIAL),
-                        scalar_bar_args=bar, lighting=False,
-                    )  # fmt: skip
-            elif self.style == "slices":
+            if self.style != "isosurface":
                 x, y, z = volume.grid.box.centre
-                plotter.add_mesh(
-                    grid.slice_orthogonal(x=x, y=y, z=z), scalars=name, clim=limits,
-                    cmap=COLOUR_MAPS.get(volume.quantity, SEQUENTIAL), scalar_bar_args=bar, lighting=False,
-                    nan_color=GREY,
-                )  # fmt: skip
+                if sliced := vectors is None or self.style == "slices":
+                    mesh = grid.slice_orthogonal(x=x, y=y, z=z)
+                else:
+                    mesh = _arrows(grid, vectors) if self.style == "arrows" else _streamlines(grid, vectors)
+                if sliced or mesh.n_points:
+                    plotter.add_mesh(
+                        mesh, scalars=name, clim=limits, cmap=COLOUR_MAPS.get(volume.quantity, SEQUENTIAL),
+                        scalar_bar_args=bar, lighting=False, nan_color=GREY,
+                    )  # fmt: skip
             else:
                 surface, masked = _surfaces(grid, name, level)
                 if surface.n_points:
@@ -106,9 +103,8 @@ class Movie(MovieSettings):
 
     def _viewpoint(self, volume: Volume) -> tuple[float, float, float]:
         azimuth, elevation = np.radians(self.azimuth), np.radians(self.elevation)
-        direction = np.array(
-            [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
-        )
+        level = np.cos(elevation)
+        direction = np.array([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)])
         x, y, z = np.array(volume.grid.box.centre) + 2.05 * float(np.linalg.norm(volume.grid.box.edges)) * direction
         return float(x), float(y), float(z)
 

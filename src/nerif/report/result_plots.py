@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+import torch
 
 from nerif.analysis.metrics import LEVELS
-from nerif.data.volume import Volume
+from nerif.data.reprojection import Reprojection
+from nerif.data.volume import Volume, name_of
 from nerif.geometry import Camera
 from nerif.plotting.drawing import COLOURS, label_of, plain, plotted_quantities, plotted_values
 from nerif.reconstruction.rig_parameters import RefinedView
 from nerif.reconstruction.uncertainty.deviations import TAILS
+from nerif.report.view_images import lattice_step
+from nerif.results.directory import Result
 from nerif.results.metrics_file import ViewScores
 
 if TYPE_CHECKING:
@@ -20,7 +25,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "banded", "draw_bands", "draw_corrections", "draw_history", "draw_line", "draw_refined_rig", "draw_reliability",
-    "draw_residuals", "draw_slice_scores", "draw_view_scores",
+    "draw_residuals", "draw_slice_scores", "draw_view_scores", "plots_of", "residuals_over_sigma",
 ]  # fmt: skip
 
 TERMS = {
@@ -38,7 +43,66 @@ NOT_DRAWN = {
 }  # fmt: skip
 LONGEST_SHIFT = 0.25  # as drawn, of the extent of the rig
 BAND_SIGMAS = TAILS["p95"]  # on either side of a band of 90 %
+MAX_RESIDUALS = 1 << 20
 GRID: dict[str, Any] = {"visible": True, "which": "major", "color": "0.9", "linewidth": 0.6}
+
+
+class Plot(NamedTuple):
+    """A plot of a result."""
+
+    name: str  #: of its file
+    title: str  #: on a page; empty if it is not shown there
+    height: float  #: over the width
+    draw: Callable[[Axes], Axes]
+
+
+def plots_of(result: Result) -> Iterator[Plot]:
+    """Yield the plots for which a result has data."""
+    metrics, views = result.metrics, result.reprojection
+    if result.history:
+        yield Plot("history", "Convergence", 0.7, partial(draw_history, history=result.history))
+    for measured, residuals in ({} if views is None else residuals_over_sigma(views)).items():
+        several = views is not None and len(views.measurement.observations) > 1
+        name, of = (f"residuals_{measured}", f" of {measured}") if several else ("residuals", "")
+        yield Plot(name, f"Residuals{of} over the noise", 0.7, partial(draw_residuals, residuals=residuals))
+    if metrics.rig:
+        yield Plot("corrections", "Corrections of the cameras", 0.8, partial(draw_corrections, table=metrics.rig))
+    if metrics.rig and views is not None:
+        draw = partial(draw_refined_rig, cameras=views.measurement.cameras, table=metrics.rig)
+        yield Plot("refined_rig", "Refined camera positions", 0.8, draw)
+    if metrics.views:
+        yield Plot("views", "", 0.8, partial(draw_view_scores, views=metrics.views))
+    for quantity in banded(result.volumes):
+        title = f"{name_of(quantity).capitalize()} with bands of 90 %"
+        yield Plot(f"bands_{quantity}", title, 0.7, partial(draw_bands, volumes=result.volumes, quantity=quantity))
+    if metrics.coverage and "reliability" in metrics.coverage:
+        draw = partial(draw_reliability, coverage=metrics.coverage)
+        yield Plot("reliability", "Reliability of the bands, against the truth", 0.9, draw)
+    if metrics.slices:
+        draw = partial(draw_slice_scores, slices=metrics.slices)
+        yield Plot("slice_scores", "Against the truth, slice by slice", 0.7, draw)
+
+
+def residuals_over_sigma(reprojection: Reprojection, max_pixels: int = MAX_RESIDUALS) -> dict[str, np.ndarray]:
+    """Return (predicted - measured) / sigma of every usable pixel whose ray crosses the box, by measured quantity.
+
+    Of more than `max_pixels` pixels, a regular lattice; quantities without sigma are left out.
+    """
+    m = reprojection.measurement
+    step, residuals = lattice_step(m, max_pixels), {}
+    for o in m.observations:
+        if o.sigma is None:
+            continue
+        usable, parts = m.usable_for(o), []
+        for i, camera in enumerate(m.cameras):
+            rows, columns = (slice(0, n, step) for n in camera.image_size)
+            pixels = camera.pixel_grid()[::step, ::step]
+            crosses = camera.rays(pixels.reshape(-1, 2), sensitivity=False).clip(m.box).crosses
+            valid = usable[i, rows, columns] & crosses.reshape(pixels.shape[:2])
+            residual = reprojection.maps[o.technique.name][i, rows, columns] - o.values[i, rows, columns]
+            parts.append((residual[valid] / o.sigma[i, rows, columns][valid]).flatten())
+        residuals[o.technique.measured] = torch.cat(parts).numpy()
+    return residuals
 
 
 def draw_history(axes: Axes, history: list[dict[str, float]]) -> Axes:
