@@ -88,11 +88,11 @@ MISTAKES = {
 @pytest.mark.parametrize("name", MISTAKES)
 def test_mistakes_are_named(clean, name):
     mistake, sentence = MISTAKES[name]
-    found = check_consistency(spoilt(clean, mistake), voxels=20)
-    assert len(found.findings) == bool(sentence)
-    assert all(finding.sentence.startswith(sentence) for finding in found.findings)
-    assert any("denser" in remark for remark in found.remarks) == (not sentence)
-    assert len(found.views) == 6
+    outcome = check_consistency(spoilt(clean, mistake), voxels=20)
+    assert len(outcome.findings) == bool(sentence)
+    assert all(finding.sentence.startswith(sentence) for finding in outcome.findings)
+    assert any("denser" in remark for remark in outcome.remarks) == (not sentence)
+    assert len(outcome.views) == 6
 
 
 @pytest.mark.slow
@@ -178,9 +178,10 @@ def test_a_shaken_camera_or_noise_cuts_nothing(small):
 
 def test_views_of_a_part_of_the_flow_accuse_nothing():
     m = square(phantom="flame", views=3, image_size=(20, 20), pixel_pitch=0.04, noise=0.02)
-    found = check_consistency(m, voxels=COARSE)
-    assert (found.findings, found.corrections) == ((), {})
-    assert found.remarks[0].startswith("the images show only 6% of the box, and the displacement does not fall to zero")
+    outcome = check_consistency(m, voxels=COARSE)
+    assert (outcome.findings, outcome.corrections) == ((), {})
+    start = "the images show only 6% of the box, and the displacement does not fall to zero"
+    assert outcome.remarks[0].startswith(start)
 
 
 # -- the maps by themselves ---------------------------------------------------------------------------------------
@@ -201,9 +202,9 @@ def test_camera_shake_and_missing_pixels_are_remarks(clean):
     shaken = spoilt(clean, in_view(2, lambda d: d + torch.tensor([1.5, 0.0])))
     valid = torch.ones(shaken.displacement.shape[:3], dtype=torch.bool)
     valid[0, :20] = False
-    found = check_consistency(replace(shaken, valid=valid), voxels=20)
-    assert any("view 60deg: displacement at the border (1." in r for r in found.remarks)
-    assert any("view 0deg: only 33% valid pixels" in r for r in found.remarks)
+    outcome = check_consistency(replace(shaken, valid=valid), voxels=20)
+    assert any("view 60deg: displacement at the border (1." in r for r in outcome.remarks)
+    assert any("view 0deg: only 33% valid pixels" in r for r in outcome.remarks)
 
 
 def test_bins_need_not_be_square():
@@ -402,11 +403,11 @@ def test_noise_is_not_repeatable(small):
 
 @pytest.mark.slow
 def test_unrelated_views_are_the_first_finding(small):
-    found = check_consistency(in_metres(small), voxels=COARSE)
-    assert [finding.code for finding in found.findings] == ["unrelated", "inside"]
-    assert "likely translation in metres, where mm are expected: without" in found.findings[0].sentence
-    assert all(view.verdict == "not predicted by the others" for view in found.views)
-    assert not found.corrections
+    outcome = check_consistency(in_metres(small), voxels=COARSE)
+    assert [finding.code for finding in outcome.findings] == ["unrelated", "inside"]
+    assert "likely translation in metres, where mm are expected: without" in outcome.findings[0].sentence
+    assert all(view.verdict == "not predicted by the others" for view in outcome.views)
+    assert not outcome.corrections
 
 
 @pytest.mark.slow

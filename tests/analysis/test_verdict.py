@@ -269,11 +269,11 @@ def with_axis(views: list[dict[str, Any]] = VIEWS, **more: Any) -> dict[str, Any
     ],
 )  # fmt: skip
 def test_reasons(settings, metrics, rating, words):
-    found = judged(settings, **metrics)
-    assert found.rating == rating
-    assert words in found.reasons
-    assert (found.error is None) == (rating == "cannot tell" or "axis" in words)
-    assert ("of the time limit" in found.reasons) == ("of the time limit" in words)
+    entry = judged(settings, **metrics)
+    assert entry.rating == rating
+    assert words in entry.reasons
+    assert (entry.error is None) == (rating == "cannot tell" or "axis" in words)
+    assert ("of the time limit" in entry.reasons) == ("of the time limit" in words)
 
 
 def test_truth_and_stated_sigma_do_not_matter():

@@ -28,7 +28,7 @@ def anyio_backend() -> str:
 
 @pytest.fixture(scope="session", autouse=True)
 def state_of_nobody(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """A state directory of the tests: nothing is written into that of whoever runs them."""
+    """A state directory of the tests: nothing is written into the user's."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
         yield
@@ -37,21 +37,21 @@ def state_of_nobody(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 @pytest.fixture(scope="session")
 def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Images of three views, one with a broken image and one without flow; something of everything else."""
-    found = tmp_path_factory.mktemp("project")
-    pictures(found / "run", ("cam1", "cam <2>", "cam3"), {"target": 3, "background": 1, "reference": 2, "flow": 2})
-    (found / "run" / "cam <2>" / "reference" / "p1.png").write_bytes(b"broken")
-    shutil.rmtree(found / "run" / "cam3" / "flow")
+    process = tmp_path_factory.mktemp("project")
+    pictures(process / "run", ("cam1", "cam <2>", "cam3"), {"target": 3, "background": 1, "reference": 2, "flow": 2})
+    (process / "run" / "cam <2>" / "reference" / "p1.png").write_bytes(b"broken")
+    shutil.rmtree(process / "run" / "cam3" / "flow")
     cameras = Ring(views=3, arc=(20.0, 100.0), image_size=(24, 30), pixel_pitch=0.2).cameras()
-    write_cameras(found / "made.toml", [CalibratedCamera.from_camera(camera) for camera in cameras])
-    Simulation(phantom="gaussians", truth_voxels=6)(cameras)[0].write(found / "m.nc")
-    result(found / "results" / "a <b>", 20, 0.0)
-    result(found / "results" / "other", 16, 0.1)
-    watched(found)
+    write_cameras(process / "made.toml", [CalibratedCamera.from_camera(camera) for camera in cameras])
+    Simulation(phantom="gaussians", truth_voxels=6)(cameras)[0].write(process / "m.nc")
+    result(process / "results" / "a <b>", 20, 0.0)
+    result(process / "results" / "other", 16, 0.1)
+    watched(process)
     grid = Grid.of_resolution(BOX, 12)
-    store = VolumeSequence.create(found / "film.zarr", [0.0, 1e-3, 2e-3], grid, ("index_excess",), AMBIENT)
+    store = VolumeSequence.create(process / "film.zarr", [0.0, 1e-3, 2e-3], grid, ("index_excess",), AMBIENT)
     for i in range(3):
         store.write(i, [Volume(Flame(BOX).sample(grid) * (1 - 0.4 * i), grid)])
-    return found
+    return process
 
 
 @pytest.fixture(scope="module")
@@ -82,5 +82,5 @@ def browser(chromium: Any) -> Iterator[Any]:
 @pytest.fixture(scope="session")
 def server(project: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     """The app on a copy of the project."""
-    with served(Path(shutil.copytree(project, tmp_path_factory.mktemp("served") / "project"))) as found:
-        yield found
+    with served(Path(shutil.copytree(project, tmp_path_factory.mktemp("served") / "project"))) as process:
+        yield process

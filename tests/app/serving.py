@@ -34,7 +34,7 @@ class Served:
     folder: Path
     link: str
     port: int
-    said: str
+    output: str
 
     @property
     def token(self) -> str:
@@ -62,9 +62,9 @@ def free_port() -> int:
 
 
 def outside() -> dict[str, str]:
-    """The environment without what tells of a test: NiceGUI behaves otherwise where it is told of one."""
-    known = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST")}
-    return {**known, "PYTHONUNBUFFERED": "1", "OMP_NUM_THREADS": "1"}
+    """The environment without pytest's variables, with which NiceGUI behaves otherwise."""
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST")}
+    return {**environment, "PYTHONUNBUFFERED": "1", "OMP_NUM_THREADS": "1"}
 
 
 @contextmanager
@@ -83,12 +83,12 @@ def served(folder: Path, *arguments: str, by: Sequence[str] = (), cwd: Path | No
 
 def answering(folder: Path, printed: Iterable[str]) -> Served:
     """Wait until a server says that it answers."""
-    said = ""
+    output = ""
     for line in printed:
-        said += line
-        if found := re.search(r"http://[^:]+:(\d+)/\?token=\S+", line):
-            return Served(folder, found[0], int(found[1]), said)
-    raise AssertionError(f"it did not start: {said}")
+        output += line
+        if match := re.search(r"http://[^:]+:(\d+)/\?token=\S+", line):
+            return Served(folder, match[0], int(match[1]), output)
+    raise AssertionError(f"it did not start: {output}")
 
 
 def opened(driver: Any, server: Served, page: str, ready: str) -> None:

@@ -74,9 +74,9 @@ def faults(driver: Any, dark: bool) -> list[Any]:
     wait_for(driver, f"return document.body.classList.contains('body--dark') === {str(dark).lower()}")
     settled(driver)
     driver.execute_script(axe())
-    found = list(driver.execute_async_script(RULES))
+    result = list(driver.execute_async_script(RULES))
     wide = driver.execute_script("return document.documentElement.scrollWidth - document.documentElement.clientWidth")
-    return [*found, *driver.execute_script(CUT), *([f"{wide} px too wide"] if wide > 0 else [])]
+    return [*result, *driver.execute_script(CUT), *([f"{wide} px too wide"] if wide > 0 else [])]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

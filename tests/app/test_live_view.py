@@ -23,12 +23,12 @@ def test_a_slow_run_is_shown_to_be_one():
     assert "note" not in status_html(job, {**live, "remark": ""})
 
 
-def test_a_surface_is_told_in_words(folder, tmp_path):
-    found = read_snapshot(folder / OUT)
-    assert found is not None
-    assert found.volume.grid.box.upper == UPPER
-    said = "Isosurface of refractive index at -5e-05, x from -6 to 6, y from -6 to 6, z from -6 to 6"
-    assert caption_of(found).startswith(said)
+def test_a_surface_has_a_caption(folder, tmp_path):
+    place = read_snapshot(folder / OUT)
+    assert place is not None
+    assert place.volume.grid.box.upper == UPPER
+    title = "Isosurface of refractive index at -5e-05, x from -6 to 6, y from -6 to 6, z from -6 to 6"
+    assert caption_of(place).startswith(title)
     snapshot(tmp_path, -50.0, 3.0)
     nothing = read_snapshot(tmp_path)
     assert nothing is not None

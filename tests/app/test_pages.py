@@ -19,9 +19,9 @@ pytestmark = pytest.mark.anyio
 
 @pytest.fixture(scope="module")
 def small(tmp_path_factory):
-    found = tmp_path_factory.mktemp("project")
-    assert main(["simulate", "-o", str(found / "m & <b>.nc"), *SIMULATE]) == 0
-    return found
+    result = tmp_path_factory.mktemp("project")
+    assert main(["simulate", "-o", str(result / "m & <b>.nc"), *SIMULATE]) == 0
+    return result
 
 
 async def test_the_design_follows_what_is_typed_and_other_tabs_begin_with_it(tmp_path):
@@ -89,9 +89,9 @@ async def test_a_run_is_watched_paused_gone_on_with_by_another_server_and_stoppe
         await user.open("reconstruct")  # a reload loses nothing
         await user.until(lambda: user.html.count("<img") >= 7)
         out = small / "results" / "m & <b>-nerif"
-        found = read_snapshot(out)
-        assert found is not None
-        assert found.view == read_live(out)["view"]
+        result = read_snapshot(out)
+        assert result is not None
+        assert result.view == read_live(out)["view"]
         user.click("Pause")
         await user.sees_soon("Paused; the checkpoint is saved.")
         assert (out / "checkpoint.safetensors").is_file() or (out / "cross_validation").is_dir()

@@ -36,9 +36,10 @@ STEPS = {
 
 def click(driver: Any, label: str) -> None:
     """Press the button with these words, once it is enabled and rests."""
-    found = f"[...document.querySelectorAll('main button')].find(b => b.textContent.includes({label!r}) && !b.disabled)"
-    wait_for(driver, f"return {found} !== undefined")
-    button, place = driver.execute_script(f"return {found}"), None
+    buttons = "[...document.querySelectorAll('main button')]"
+    result = f"{buttons}.find(b => b.textContent.includes({label!r}) && !b.disabled)"
+    wait_for(driver, f"return {result} !== undefined")
+    button, place = driver.execute_script(f"return {result}"), None
     rests = "arguments[0].scrollIntoView({block: 'center'}); return arguments[0].getBoundingClientRect().toJSON()"
     while place != (place := driver.execute_script(rests, button)):  # a form that unfolds moves what is below it
         time.sleep(0.15)
@@ -98,10 +99,10 @@ def test_from_images_to_an_exported_volume(browser, tmp_path):
     assert (about["outcome"], about["seconds"] < LONGEST_RUN) == ("steps", True)
     assert ResultDirectory(out).read().metrics.views
     assert (out / "report.html").stat().st_size > 100_000
-    found = read_volumes(folder / "exports" / "field.nc")["index_excess"].values.numpy()
-    known = read_volumes(folder / "images" / "truth" / "volume.nc")["index_excess"].values.numpy()
-    known = known.reshape(24, 2, 24, 2, 24, 2).mean(axis=(1, 3, 5))
-    assert np.corrcoef(found[np.isfinite(found)], known[np.isfinite(found)])[0, 1] > 0.7
+    result = read_volumes(folder / "exports" / "field.nc")["index_excess"].values.numpy()
+    exact = read_volumes(folder / "images" / "truth" / "volume.nc")["index_excess"].values.numpy()
+    exact = exact.reshape(24, 2, 24, 2, 24, 2).mean(axis=(1, 3, 5))
+    assert np.corrcoef(result[np.isfinite(result)], exact[np.isfinite(result)])[0, 1] > 0.7
 
 
 def export(driver: Any) -> None:

@@ -1,4 +1,4 @@
-"""Who is let in, what leaves, and how the server begins and ends: a real one, asked over the wire."""
+"""Who is let in, what leaves, and how the server begins and ends: a real one, over its port."""
 
 from __future__ import annotations
 
@@ -48,17 +48,17 @@ def test_without_the_token_nothing_is_answered_and_with_the_cookie_it_is(server)
 def test_the_token_is_exchanged_for_a_cookie_that_no_script_reads(server):
     status, headers, _ = server.get(f"/design?token={server.token}&x=1")
     assert (status, headers["refresh"]) == (200, "0; url=/design?x=1")
-    kept = headers["set-cookie"]
-    assert all(word in kept for word in ("HttpOnly", "SameSite=Strict", cookie_of(server.token)))
-    assert server.token not in kept
+    stored = headers["set-cookie"]
+    assert all(word in stored for word in ("HttpOnly", "SameSite=Strict", cookie_of(server.token)))
+    assert server.token not in stored
 
 
 def test_cookies_of_other_programs_lock_nobody_out(server):
-    own = server.cookie()
-    for foreign in ('prefs={"a":1}', "x[y]=1", "name=\xfc\xdf", "a", "=;;", f"nerif-{server.port}=old", own):
-        for cookies in (f"{foreign}; {own}", f"{own};{foreign}"):
+    authorised = server.cookie()
+    for foreign in ('prefs={"a":1}', "x[y]=1", "name=\xfc\xdf", "a", "=;;", f"nerif-{server.port}=old", authorised):
+        for cookies in (f"{foreign}; {authorised}", f"{authorised};{foreign}"):
             assert server.get("/design", {"Cookie": cookies})[0] == 200
-        assert server.get("/design", {"Cookie": foreign.replace(own, "")})[0] == 403
+        assert server.get("/design", {"Cookie": foreign.replace(authorised, "")})[0] == 403
 
 
 def test_a_foreign_name_that_leads_here_and_a_page_of_others_are_refused(server):
@@ -104,18 +104,18 @@ def proxied(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
 @pytest.mark.parametrize("host", [HUB, "localhost:9000", ""])
 def test_a_tunnel_and_a_proxy_that_removes_or_keeps_its_path(proxied, host, inside):
     """jupyter-server-proxy passes the browser's Host and Origin on, and states its path besides."""
-    own = {"Host": host or f"127.0.0.1:{proxied.port}", "X-Forwarded-Prefix": ROOT}
-    status, headers, _ = proxied.get(f"{inside}/?token={proxied.token}", own)
+    authorised = {"Host": host or f"127.0.0.1:{proxied.port}", "X-Forwarded-Prefix": ROOT}
+    status, headers, _ = proxied.get(f"{inside}/?token={proxied.token}", authorised)
     assert (status, headers["refresh"]) == (200, f"0; url={ROOT}/")
     assert f"Path={ROOT};" in headers["set-cookie"] + ";"
-    own |= {"Cookie": headers["set-cookie"].partition(";")[0], "Origin": f"https://{own['Host']}"}
-    assert proxied.get(f"{inside}/", own)[1]["location"] == "design"
-    page = proxied.get(f"{inside}/design", own)[2]
+    authorised |= {"Cookie": headers["set-cookie"].partition(";")[0], "Origin": f"https://{authorised['Host']}"}
+    assert proxied.get(f"{inside}/", authorised)[1]["location"] == "design"
+    page = proxied.get(f"{inside}/design", authorised)[2]
     assert f'src="{ROOT}{STATIC.rpartition("/")[0]}/nicegui.js"' in page
     assert ROOT + ROOT not in page
-    assert proxied.get(inside + STATIC, own)[0] == proxied.get(inside + SOCKET, own)[0] == 200
+    assert proxied.get(inside + STATIC, authorised)[0] == proxied.get(inside + SOCKET, authorised)[0] == 200
     assert "href='results'" in page.replace("\\u003E", ">").replace("\\", "")
-    assert " 101" in upgrade(proxied, f"Cookie: {own['Cookie']}", f"Origin: {own['Origin']}")
+    assert " 101" in upgrade(proxied, f"Cookie: {authorised['Cookie']}", f"Origin: {authorised['Origin']}")
 
 
 def test_an_allowed_host_admits_no_other(proxied):
@@ -133,8 +133,8 @@ def test_a_refused_address_names_the_option_and_the_token(server):
     text = server.get("/design", {"Host": "localhost:9000", "Cookie": server.cookie()})[2]
     assert "address of this server: localhost:9000. If that is a tunnel or proxy" in text
     assert "--allowed-host localhost:9000 (and --root-path" in text
-    own = {"Host": f"127.0.0.1:{server.port}", "Cookie": server.cookie()}
-    assert "--allowed-host hub.example.org " in server.get("/design", {**own, "Origin": "https://hub.example.org"})[2]
+    authorised = {"Host": f"127.0.0.1:{server.port}", "Cookie": server.cookie()}
+    assert "--allowed-host hub.example.org " in server.get("/design", {**authorised, "Origin": "https://hub.example.org"})[2]
     assert "/?token=..." in server.get("/design")[2]
     for strange in ("<b>x</b>", "a b", "x;rm", "h:port"):
         assert server.get("/design", {"Host": strange})[::2] == (421, "This is not an address of this server.")
@@ -152,10 +152,10 @@ def test_addresses_that_are_none_are_refused(tmp_path, option, values):
 
 def test_it_listens_on_this_machine_alone(server):
     with socket.socket() as probe:
-        own = socket.gethostbyname(socket.gethostname())
-        if own.startswith("127."):
+        authorised = socket.gethostbyname(socket.gethostname())
+        if authorised.startswith("127."):
             pytest.skip("this machine has no other address than its own")
-        assert probe.connect_ex((own, server.port)) != 0
+        assert probe.connect_ex((authorised, server.port)) != 0
 
 
 def test_others_are_let_in_with_a_token_only():
@@ -170,8 +170,8 @@ def test_a_server_for_all_interfaces_answers_to_the_address_of_each(monkeypatch)
         "eth0": [(socket.AF_INET, "192.0.2.7"), (socket.AF_INET6, "fe80::1%eth0"), (-1, "02:00:5e:10:00:00")],
         "lo": [(socket.AF_INET, "127.0.0.1")],
     }  # fmt: skip
-    found = {name: [SimpleNamespace(family=f, address=a) for f, a in rows] for name, rows in there.items()}
-    monkeypatch.setattr(psutil, "net_if_addrs", lambda: found)
+    child = {name: [SimpleNamespace(family=f, address=a) for f, a in rows] for name, rows in there.items()}
+    monkeypatch.setattr(psutil, "net_if_addrs", lambda: child)
     monkeypatch.setattr(socket, "getaddrinfo", lambda *_: [(socket.AF_INET, 1, 6, "", ("127.0.1.1", 0))])
     names = Address("0.0.0.0", 1, "x" * 16).names
     assert {"192.0.2.7", "[fe80::1]", socket.gethostname()} <= set(names)
@@ -273,11 +273,11 @@ def test_a_folder_without_rights_is_told_in_one_line_and_can_be_read(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize(("error", "shown"), [("No response returned.", False), ("out of tune", True)])
-def test_a_browser_that_goes_on_is_no_error_and_all_else_is(error, shown):
+@pytest.mark.parametrize(("error", "logged"), [("No response returned.", False), ("out of tune", True)])
+def test_a_browser_that_goes_on_is_no_error_and_all_else_is(error, logged):
     try:
         raise RuntimeError(error)
     except RuntimeError:
         entry = logging.LogRecord("uvicorn.error", logging.ERROR, "", 0, "Exception", (), sys.exc_info())
-    assert is_relevant(entry) is shown
+    assert is_relevant(entry) is logged
     assert is_relevant(logging.LogRecord("uvicorn.error", logging.INFO, "", 0, "ready", (), None))

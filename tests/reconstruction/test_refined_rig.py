@@ -9,7 +9,6 @@ from dataclasses import replace
 import pytest
 import torch
 from matplotlib.figure import Figure
-from nerif.report.result_plots import draw_corrections
 
 from nerif.analysis.rig_check import check_rig
 from nerif.cli.cli import main
@@ -24,6 +23,7 @@ from nerif.reconstruction.rig_refinement import Refinement, refit
 from nerif.reconstruction.uncertainty.rig_posterior import RigPosterior
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.reconstruction.voxels.total_variation import TotalVariation
+from nerif.report.result_plots import draw_corrections
 from nerif.results.directory import ResultDirectory
 from nerif.simulation.simulate import simulate
 from nerif.workflow.pipeline import reconstruct_into
