@@ -54,7 +54,7 @@ def loaded() -> dict[str, set[str]]:
 
 
 @pytest.mark.parametrize("stage", ["help", "missing input"])
-def test_help_and_a_missing_input_load_next_to_nothing(loaded, stage):
+def test_help_and_a_missing_input_load_little(loaded, stage):
     assert not loaded[stage] & {"torch", "numpy", "pydantic", *HEAVY}
 
 

@@ -29,6 +29,5 @@ def test_texts_are_plain_and_names_are_nouns(path: Path) -> None:
         text = "\n".join(n.value for n in nodes if isinstance(n, ast.Constant) and isinstance(n.value, str))
         names = {str(getattr(n, a)) for n in nodes for a in ("id", "arg", "name", "attr") if hasattr(n, a)}
         text += "\n".join(name.replace("_", " ") for name in names if name.startswith("test_"))
-        text += "\n".join(name.replace("_", " ") for name in names if name.startswith("test_"))
     assert not re.findall(WORDS.replace("\n", ""), text, re.IGNORECASE)
     assert not names & set(NAMES)

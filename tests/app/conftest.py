@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from app.projects import AMBIENT, BOX, pictures, result, watched
+from app.projects import AMBIENT, BOX, images, result, watched
 from app.serving import Served, served
 from nerif.data.cameras_file import CalibratedCamera, write_cameras
 from nerif.data.volume import Volume
@@ -37,21 +37,21 @@ def state_of_nobody(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 @pytest.fixture(scope="session")
 def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Images of three views, one with a broken image and one without flow; something of everything else."""
-    process = tmp_path_factory.mktemp("project")
-    pictures(process / "run", ("cam1", "cam <2>", "cam3"), {"target": 3, "background": 1, "reference": 2, "flow": 2})
-    (process / "run" / "cam <2>" / "reference" / "p1.png").write_bytes(b"broken")
-    shutil.rmtree(process / "run" / "cam3" / "flow")
+    project = tmp_path_factory.mktemp("project")
+    images(project / "run", ("cam1", "cam <2>", "cam3"), {"target": 3, "background": 1, "reference": 2, "flow": 2})
+    (project / "run" / "cam <2>" / "reference" / "p1.png").write_bytes(b"broken")
+    shutil.rmtree(project / "run" / "cam3" / "flow")
     cameras = Ring(views=3, arc=(20.0, 100.0), image_size=(24, 30), pixel_pitch=0.2).cameras()
-    write_cameras(process / "made.toml", [CalibratedCamera.from_camera(camera) for camera in cameras])
-    Simulation(phantom="gaussians", truth_voxels=6)(cameras)[0].write(process / "m.nc")
-    result(process / "results" / "a <b>", 20, 0.0)
-    result(process / "results" / "other", 16, 0.1)
-    watched(process)
+    write_cameras(project / "made.toml", [CalibratedCamera.from_camera(camera) for camera in cameras])
+    Simulation(phantom="gaussians", truth_voxels=6)(cameras)[0].write(project / "m.nc")
+    result(project / "results" / "a <b>", 20, 0.0)
+    result(project / "results" / "other", 16, 0.1)
+    watched(project)
     grid = Grid.of_resolution(BOX, 12)
-    store = VolumeSequence.create(process / "film.zarr", [0.0, 1e-3, 2e-3], grid, ("index_excess",), AMBIENT)
+    store = VolumeSequence.create(project / "film.zarr", [0.0, 1e-3, 2e-3], grid, ("index_excess",), AMBIENT)
     for i in range(3):
         store.write(i, [Volume(Flame(BOX).sample(grid) * (1 - 0.4 * i), grid)])
-    return process
+    return project
 
 
 @pytest.fixture(scope="module")

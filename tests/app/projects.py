@@ -21,7 +21,7 @@ from nerif.reconstruction.reconstructor import Outcome, Reconstruction
 from nerif.results.directory import LIVE, LIVE_FIELD, ResultDirectory
 from nerif.results.metrics_file import Metrics
 
-__all__ = ["AMBIENT", "BOX", "OUT", "REPORT", "SIMULATE", "TARGET", "pictures", "result", "snapshot", "watched"]
+__all__ = ["AMBIENT", "BOX", "OUT", "REPORT", "SIMULATE", "TARGET", "images", "result", "snapshot", "watched"]
 
 BOX = Box((-25.0, -24.0, -20.0), (25.0, 24.0, 20.0))
 AMBIENT = 1.00027
@@ -30,14 +30,14 @@ SIMULATE = ["--image-size", "20", "24", "--pixel-pitch", "0.18", "--views", "4",
 SIMULATE += ["--truth-voxels", "8"]
 OUT = "results/live <b>"
 LOWER, UPPER = (-20.0, -15.0, -10.0), (20.0, 15.0, 10.0)
-REPORT = """<!doctype html><title>r</title><p id=said>nothing</p><script>
-const said = document.querySelector('#said'); said.textContent = 'run';
-try { parent.document.title = 'taken'; said.textContent += ' reached' } catch { said.textContent += ' kept out' }
-fetch('/design').then(() => { said.textContent += ' fetched' }, () => { said.textContent += ' refused' });
+REPORT = """<!doctype html><title>r</title><p id=outcome>nothing</p><script>
+const outcome = document.querySelector('#outcome'); outcome.textContent = 'run';
+try { parent.document.title = 'taken'; outcome.textContent += ' reached' } catch { outcome.textContent += ' barred' }
+fetch('/design').then(() => { outcome.textContent += ' fetched' }, () => { outcome.textContent += ' refused' });
 </script>"""
 
 
-def pictures(folder: Path, views: tuple[str, ...], counts: dict[str, int]) -> None:
+def images(folder: Path, views: tuple[str, ...], counts: dict[str, int]) -> None:
     """Images of an upright target, by source; the third of a source, if it has one, is empty."""
     board = (40 + 170 * TARGET.raster(TARGET.pitch / 8)).astype(np.uint8)
     for name in views:
@@ -54,18 +54,18 @@ def result(path: Path, voxels: int, error: float) -> None:
     """A finished result of a flame, as nerif reconstruct leaves it, with standard deviations."""
     grid = Grid.of_resolution(BOX, voxels)
     values = Flame(BOX).sample(grid)
-    found = ResultDirectory(path)
-    found.begin({"measurement": "m.nc", "method": "tikhonov"})
+    directory = ResultDirectory(path)
+    directory.begin({"measurement": "m.nc", "method": "tikhonov"})
     field = VoxelField.through(values, grid)
-    found.write_field(Reconstruction(field, BOX, AMBIENT, [], Outcome("converged", "by hand"), {}))
+    directory.write_field(Reconstruction(field, BOX, AMBIENT, [], Outcome("converged", "by hand"), {}))
     index = Volume.of(values * (1 + error), grid, "index_excess", AMBIENT)
-    found.write_volumes([index, Volume.of((values * 0.02).abs(), grid, "index_excess_std", AMBIENT)])
+    directory.write_volumes([index, Volume.of((values * 0.02).abs(), grid, "index_excess_std", AMBIENT)])
     views = [
         {"name": str(i), "withheld": i == 0, "measured": "displacement", "unit": "px", "cc": 0.99, "rms": 0.01,
          "ssim": 0.99, "psnr": 40.0, "pixels": 100, "rms_predicted": 0.5, "rms_measured": 0.5} for i in range(5)
     ]  # fmt: skip
     trials = {"kind": "fast", "trials": 2, "diverged_trials": [], "seconds": 4.0}
-    found.write_metrics(Metrics(views=views, outcome="converged", seconds=12.0, uncertainty=trials))
+    directory.write_metrics(Metrics(views=views, outcome="converged", seconds=12.0, uncertainty=trials))
     (path / "report.html").write_text(REPORT)
 
 

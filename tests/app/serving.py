@@ -28,7 +28,7 @@ class Served:
     folder : of the project
     link : address with the token
     port : that it listens on
-    said : its first lines
+    output : its first lines
     """
 
     folder: Path

@@ -31,13 +31,13 @@ def measured(views: int, size: tuple[int, int], pitch: float, steps: int) -> Mea
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """A measurement by six views, one of which is mirrored in another."""
-    found = tmp_path_factory.mktemp("project")
+    project = tmp_path_factory.mktemp("project")
     good = measured(6, (30, 36), 0.12, 30)
-    good.write(found / "good.nc")
+    good.write(project / "good.nc")
     d = good.displacements.clone()
     d[3] = d[3].flip(1) * torch.tensor([-1.0, 1.0])
-    replace(good, displacement=d).write(found / "bad.nc")
-    return found
+    replace(good, displacement=d).write(project / "bad.nc")
+    return project
 
 
 @pytest.mark.slow
@@ -72,8 +72,8 @@ async def test_a_mirrored_view_is_found_and_undone(folder):
         await user.sees_soon("the image is mirrored left to right")
         user.click("Correct the mistakes")
         await user.sees_soon("Go on with bad.corrected.nc")
-        found, good = Measurement.read(folder / "bad.corrected.nc"), Measurement.read(folder / "good.nc")
-        torch.testing.assert_close(found.displacement, good.displacement)
+        corrected, good = Measurement.read(folder / "bad.corrected.nc"), Measurement.read(folder / "good.nc")
+        torch.testing.assert_close(corrected.displacement, good.displacement)
         user.click("Go on with bad.corrected.nc")
         await user.until(lambda: "bad.corrected.nc" in user.lines()[0])
 
@@ -93,9 +93,9 @@ async def test_a_model_is_added(folder):
 
 @pytest.mark.slow
 async def test_a_mask_is_drawn_taken_back_and_put_in(folder):
-    own = folder / "masks" / "good" / "0deg.png"  # drawn elsewhere, with another program
-    own.parent.mkdir(parents=True)
-    own.write_bytes(b"of the user")
+    drawing = folder / "masks" / "good" / "0deg.png"  # drawn elsewhere, with another program
+    drawing.parent.mkdir(parents=True)
+    drawing.write_bytes(b"of the user")
     async with visiting(folder) as user:
         await user.open("displacement", "Drawn in no view.")
         if user.control("Measurement").value != "good.nc":
@@ -125,7 +125,7 @@ async def test_a_mask_is_drawn_taken_back_and_put_in(folder):
         mask = Measurement.read(folder / "good.masked.nc").flow_mask
         assert bool(mask[0, 4:25, 6:30].all())
         assert not bool(mask[0, :3].any())
-        assert own.read_bytes() == b"of the user"
+        assert drawing.read_bytes() == b"of the user"
         user.click("Go on with good.masked.nc")
         await user.until(lambda: user.control("Measurement").value == "good.masked.nc")
         user.put("Maps of all views", True)

@@ -19,9 +19,9 @@ EFFECT = "document.querySelector('[aria-label=\"Effect of the shape\"] [aria-pre
 
 def click(driver: Any, label: str, within: str = "body") -> None:
     """Press a button by what it says."""
-    found = f"[...document.querySelectorAll('{within} button')].find(b => b.textContent.includes({label!r}))"
-    wait_for(driver, f"return {found} !== undefined")
-    driver.execute_script(f"const b = {found}; b.scrollIntoView({{block: 'center'}}); b.click()")
+    match = f"[...document.querySelectorAll('{within} button')].find(b => b.textContent.includes({label!r}))"
+    wait_for(driver, f"return {match} !== undefined")
+    driver.execute_script(f"const b = {match}; b.scrollIntoView({{block: 'center'}}); b.click()")
 
 
 def keys(driver: Any, *presses: str) -> None:
@@ -99,9 +99,9 @@ def test_a_crop_is_drawn_and_reference_and_flow_change_places_by_key_and_clock(b
     drag(browser, ".cropper", 100, 60)
     wait_for(browser, "return Number(document.querySelector('input[name=width]').value) < 96")
     both = browser.find_element("css selector", ".both")
-    for shown in ("Flow", "Reference"):
+    for title in ("Flow", "Reference"):
         both.send_keys(Keys.SPACE)
-        assert text(browser, ".current") == shown
+        assert text(browser, ".current") == title
     click(browser, "Blink")
     wait_for(browser, "return document.querySelector('.current').textContent === 'Flow'")
     click(browser, "Blink")
@@ -130,8 +130,8 @@ def test_a_report_runs_in_a_sandbox_and_a_surface_is_drawn(browser, server):
             loaded = "performance.getEntriesByType('resource').filter(e => /surface\\?/.test(e.name))"
             wait_for(browser, f"return {loaded}.length === 1")
     browser.switch_to.frame(browser.find_element("css selector", "iframe.report"))
-    wait_for(browser, "return document.querySelector('#said')?.textContent.split(' ').length > 3")
-    assert text(browser, "#said") == "run kept out refused"
+    wait_for(browser, "return document.querySelector('#outcome')?.textContent.split(' ').length > 3")
+    assert text(browser, "#outcome") == "run barred refused"
     browser.switch_to.default_content()
 
 

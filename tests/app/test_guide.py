@@ -64,9 +64,9 @@ def test_a_new_folder_is_filled_once_also_after_an_interruption(tmp_path, render
         patch.setattr(demo, "render", interrupted)
         with pytest.raises(KeyboardInterrupt):
             demo.fill(folder)
-    for said in ("rendering", "earlier start"):
+    for phrase in ("rendering", "earlier start"):
         demo.fill(folder)
-        assert said in capsys.readouterr().out
+        assert phrase in capsys.readouterr().out
     assert renders == [folder / "images"]
     assert demo.is_demo(folder)
     assert json.loads((folder / demo.MARK).read_text()) == {"complete": True}
@@ -127,8 +127,8 @@ def test_states_follow_the_files(tmp_path, project):
 
     def states(*names: str) -> list[str]:
         """What the guide says on pages, and where its link leads."""
-        found = [state(work, pages[name], PAGES) for name in names]
-        return [f"{sentence} {word} {page.name if page else ''}".strip() for sentence, word, page in found]
+        states = [state(work, pages[name], PAGES) for name in names]
+        return [f"{sentence} {word} {page.name if page else ''}".strip() for sentence, word, page in states]
 
     assert states("design", "images") == ["Next: images", "Next: calibration"]
     assert states("calibration", "displacement", "results") == [

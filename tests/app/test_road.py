@@ -31,7 +31,7 @@ STEPS = {
     "check": ("--voxels 12", "Compare the views", 90, "document.querySelectorAll('.tabled tbody tr').length === 6"),
     "reconstruct": ("--max-steps 250", "Start", 240, "document.querySelector('.curve')?.checkVisibility()"),
 }
-"""By page: words that the values of its hint give, the button of its run, its longest time in s, what is shown then."""
+"""By page: words that the values of its hint give, the button of its run, its longest time in s, what it shows."""
 
 
 def click(driver: Any, label: str) -> None:
@@ -48,7 +48,7 @@ def click(driver: Any, label: str) -> None:
 
 def step(driver: Any, page: str, folder: Path) -> None:
     """Do on a page what its hint says."""
-    words, button, seconds, shown = STEPS[page]
+    words, button, seconds, visible = STEPS[page]
     if words:
         click(driver, "Fill in the values")
         lines = "[...document.querySelectorAll('.command code')].map(code => code.textContent)"
@@ -71,8 +71,8 @@ def step(driver: Any, page: str, folder: Path) -> None:
         wait_for(driver, f"return {STATUS} === 'Done.'", seconds)
     if page == "displacement":
         click(driver, "Go on with measurement.nc")
-    if shown:
-        wait_for(driver, f"return Boolean({shown})", 60)
+    if visible:
+        wait_for(driver, f"return Boolean({visible})", 60)
 
 
 def test_from_images_to_an_exported_volume(browser, tmp_path):

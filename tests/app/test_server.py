@@ -260,13 +260,13 @@ def test_pages_below_the_path_of_a_proxy_lead_to_one_another(browser, proxied):
 
 
 @pytest.mark.slow
-def test_a_folder_without_rights_is_told_in_one_line_and_can_be_read(tmp_path):
+def test_a_folder_without_rights_is_refused_in_one_line_and_can_be_read(tmp_path):
     root = os.geteuid() == 0
     if root and shutil.which("setpriv") is None:
         pytest.skip("root may write everywhere, and setpriv, by which it may not, is not there")
     tmp_path.chmod(0o555)
     with served(tmp_path, by=BOUND if root else ()) as server:
-        assert f"note: {READ_ONLY}" in server.said
+        assert f"note: {READ_ONLY}" in server.output
         for page in PAGES:
             assert READ_ONLY in server.get(page.path, {"Cookie": server.cookie()})[2]
     tmp_path.chmod(0o755)

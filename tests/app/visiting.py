@@ -78,14 +78,15 @@ class Visitor:
 
     def lines(self) -> list[list[str]]:
         """The words of all command lines on the page."""
-        found = re.findall(r"<code tabindex=0>(.*?)</code>", self.html)
-        return [shlex.split(unescape(re.sub(r"<[^>]+>", "", line))) for line in found]
+        matches = re.findall(r"<code tabindex=0>(.*?)</code>", self.html)
+        return [shlex.split(unescape(re.sub(r"<[^>]+>", "", line))) for line in matches]
 
     def control(self, name: str) -> Any:
         """The control with a name, a label for screen readers, a label or a text."""
         for key in ("name", "aria-label", "label", "text"):
-            if found := [e for e in self.all() if name == (getattr(e, key, "") if key == "text" else e.props.get(key))]:
-                return found[-1]
+            values = ((e, getattr(e, key, "") if key == "text" else e.props.get(key)) for e in self.all())
+            if matches := [e for e, value in values if value == name]:
+                return matches[-1]
         raise AssertionError(f"no control {name}: {self.text}")
 
     def put(self, name: str, value: Any) -> None:
@@ -107,9 +108,9 @@ class Visitor:
     def click(self, label: str) -> None:
         """Press the enabled button whose label or label for screen readers begins with this."""
         texts = lambda b: (b.text, b.props.get("aria-label", ""))  # noqa: E731
-        found = [b for b in self.all(ui.button) if b.enabled and any(t.startswith(label) for t in texts(b))]
-        assert found, f"no button {label}: {self.text}"
-        self.fire(found[0], "click")
+        matches = [b for b in self.all(ui.button) if b.enabled and any(t.startswith(label) for t in texts(b))]
+        assert matches, f"no button {label}: {self.text}"
+        self.fire(matches[0], "click")
 
     def fire(self, element: ui.element, event: str, args: Any = None) -> None:
         """Let an event happen to an element."""

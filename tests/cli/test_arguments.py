@@ -184,8 +184,8 @@ def help_of(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[str, list[
 def test_help_shows_the_frequent_options_in_groups_and_all_that_people_set(method, capsys):
     text, flags = help_of(capsys, "reconstruct", "--method", method, "--help")
     assert 14 <= len(flags) <= 20
-    shown = [line[:-1] for line in text.splitlines() if re.fullmatch(r"\w+:", line)]
-    assert shown == [group for group in GROUPS if group not in ("frames", "computers")]
+    groups = [line[:-1] for line in text.splitlines() if re.fullmatch(r"\w+:", line)]
+    assert groups == [group for group in GROUPS if group not in ("frames", "computers")]
     assert ("max-steps" in flags, "iterations" in flags) == (method == "nerif", method != "nerif")
     text, flags = help_of(capsys, "reconstruct", "--method", method, "--help", "all")
     assert ("learning-rate" in flags) is (method == "nerif")

@@ -131,7 +131,7 @@ class ProjectFolder:
             with suppress(OSError, InputError):
                 if path.resolve().is_relative_to(self.folder) and (kind := self._kind(path)):
                     names[kind].append(word_of(path.relative_to(self.folder).as_posix()))
-        return Contents(**{kind: tuple(sorted(found)) for kind, found in names.items()})
+        return Contents(**{kind: tuple(sorted(paths)) for kind, paths in names.items()})
 
     def _walk(self, folder: Path, depth: int, count: list[int]) -> Iterator[Path]:
         """Yield the folder, its files and its folders; stores and results are not searched further."""

@@ -105,12 +105,12 @@ class CalibrationImages:
         if detection is not None:
             count, marks = f"{len(detection.points)} points found", _marks(detection, shape)
             error = ", not used" if errors else ""
-        if found := errors.get(name):
-            error = f", rms <b>{found.rms:.3f} px</b>{'' if found.used else ', did not fit'}"
+        if error := errors.get(name):
+            error = f", rms <b>{error.rms:.3f} px</b>{'' if error.used else ', did not fit'}"
         with ui.element("div").classes("target") as cell:
-            picture = f'<img src="{address}" alt="{escape(f"{name}, {count}")}">'
+            img = f'<img src="{address}" alt="{escape(f"{name}, {count}")}">'
             caption = f"<figcaption><b>{escape(name)}</b><br>{count}{error}</figcaption>"
-            html(f"<span class=shot>{picture}{marks}</span>{caption}", "figure")
+            html(f"<span class=shot>{img}{marks}</span>{caption}", "figure")
             if detection is None:
                 return
             button = ui.button().props("outline dense")
