@@ -126,7 +126,7 @@ def test_images_that_were_not_fitted_are_not_judged():
     images = [{**v, "measured": "flow", "unit": "1"} for v in views_of(0.8)]
     first = first_run(0.1)
     both = {**first, "views": [*first["views"], {**noisy("a", 0.9, True), "measured": "flow"}]}
-    settings = {"method": "nerif", "source": "displacements"}
+    settings = {"method": "nerif", "from": "displacements"}
     metrics = Metrics(outcome="steps", views=[*images, *views_of(0.02)], cross_validation=both)
     assert verdict(Result(Path(), settings=settings, metrics=metrics)).sentence == (
         judged(views=views_of(0.02), cross_validation=first).sentence

@@ -146,7 +146,7 @@ def test_a_refused_address_names_the_option_and_the_token(server):
 ])  # fmt: skip
 def test_addresses_that_are_none_are_refused(tmp_path, option, values):
     for value in values:
-        with pytest.raises(InputError, match=f"^{option.replace('-', '_')}: expected"):
+        with pytest.raises(InputError, match=f"{option.replace('-', '.')}: expected"):
             read_settings(App(), [str(tmp_path), f"--{option}", value], "app")
 
 

@@ -82,8 +82,8 @@ def test_straight_and_traced_rays_agree(ball, box):
     ("kind", "technique", "rows"), [("perspective", "deflection", 1), ("telecentric", "deflection", 20),
                                     ("telecentric", "interferometry", 1)],
 )  # fmt: skip
-def test_the_adjoint_of_the_voxel_operator_is_exact(outcome, box, kind, technique, rows):
-    model = forward_model(TECHNIQUES[technique], replace(outcome, wavelength_nm=532.0))
+def test_the_adjoint_of_the_voxel_operator_is_exact(simulated, box, kind, technique, rows):
+    model = forward_model(TECHNIQUES[technique], replace(simulated, wavelength_nm=532.0))
     rays = Rays.concatenate([c.rays(c.pixel_grid().reshape(-1, 2)).clip(box) for c in ring(kind, rows)])
     a = VoxelOperator(
         rays[rays.crosses], Grid(box, (9, 11, 13)), model, boundary=Boundary(("x-", "y+")), dtype=torch.float64
@@ -156,8 +156,8 @@ def test_a_field_comes_back_and_is_seen_again(simulated, ball, box):
     assert float(left.norm() / simulated.displacement[usable].norm()) < 0.07  # 0.057
 
 
-def test_a_background_before_the_box_is_refused(outcome):
-    plane = outcome.cameras[2].plane
+def test_a_background_before_the_box_is_refused(simulated):
+    plane = simulated.cameras[2].plane
     for offset in (-plane.offset, 3.0):
         wrong = replace(simulated.cameras[2], background=replace(plane, offset=offset))
         with pytest.raises(InputError, match="background of view '72deg': expected a plane behind the box"):

@@ -98,5 +98,6 @@ def test_invalid_settings_are_refused(store, tmp_path, monkeypatch, capsys, argu
     monkeypatch.chdir(tmp_path)
     quantity = [] if "--quantity" in arguments else ["--quantity", "index_excess"]
     assert main(["movie", str(store.path), *quantity, *arguments]) == 2
-    assert re.search(rf"{field}(:|'\.) expected", capsys.readouterr().err, re.IGNORECASE)
+    name = field.replace("_", ".")
+    assert re.search(rf"{name}(:|'\.) expected", capsys.readouterr().err, re.IGNORECASE)
     assert not list(tmp_path.iterdir())

@@ -253,7 +253,7 @@ def test_motion_of_wrong_units_is_refused(film: Path, times: float, lengths: flo
 
 
 def test_a_velocity_that_does_not_explain_its_film_exits_with_1(film: Path, tmp_path: Path, capsys, monkeypatch):
-    monkeypatch.setattr("nerif.cli.commands.velocity.MOST_MISFIT", 0.01)
+    monkeypatch.setattr("nerif.analysis.velocity_verdict.MOST_MISFIT", 0.01)
     monkeypatch.setattr("nerif.analysis.velocity_verdict.MISFIT", (0.005, 0.01))
     assert run("velocity", film, "-o", tmp_path / "v.zarr", "--frames", "0", "3", *ROUGH) == 1
     printed = capsys.readouterr()
