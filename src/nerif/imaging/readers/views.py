@@ -315,9 +315,7 @@ def _from_file(file: Path) -> list[View]:
             expected = f"expected {', '.join(PATTERNS)} or none"
             raise InputError(f"'mosaic' of view '{name}': {expected}, got '{mosaic}'", field=file)
         crop, paths = ({k: v for k, v in entries.items() if k in keys} for keys in (CROP, SOURCES))
-        sources = {
-            k: str(local_path(v, file.parent, f"{file}: {k} of view '{name}'")) for k, v in paths.items()
-        }
+        sources = {k: str(local_path(v, file.parent, f"{file}: {k} of view '{name}'")) for k, v in paths.items()}
         views.append(View(name, file.parent, sources, Crop(**crop) if crop else None, mosaic, entries.get(OFFSET)))
     return views
 
