@@ -32,7 +32,7 @@ NERIF = ["--preset", "fast", "--max-steps", "60", "--points-per-batch", "1024", 
 RECONSTRUCTIONS = {
     "nerif": ("balls", NERIF),
     "nerif_withheld": ("flame", [*NERIF, "--withhold", "85deg", "--seed", "2"]),
-    "nerif_paper": ("balls", [*NERIF, "--preset", "paper", "--max-steps", "6"]),
+    "nerif_paper": ("balls", ["--preset", "paper", "--max-steps", "6", *NERIF[4:]]),
     "nerif_rig": ("balls", [*NERIF, "--refine", "cameras"]),
     "nerif_bootstrap": ("balls", [*NERIF, "--uncertainty", "fast"]),
     "tv": ("balls", ["--method", "tv", "--iterations", "20", "--device", "cpu"]),
