@@ -6,15 +6,18 @@ import pytest
 import torch
 
 from bodies import cuboid
+from nerif.analysis.prediction import predict, reproject
 from nerif.fields.field import Field
 from nerif.fields.jets import AXISYMMETRIC
 from nerif.fields.network import UNBOUNDED, NetworkShape, NeuralField
 from nerif.fields.network_kinds import network_in
 from nerif.fields.phantoms import Flame, GaussianBalls, Octahedron, make_phantom
 from nerif.fields.sum import SumField
-from nerif.fields.symmetric import SymmetricVoxels
+from nerif.fields.symmetric import SymmetricVoxels, symmetry_of_field
 from nerif.fields.turbulence import Fire, TurbulentPlume
 from nerif.fields.voxel_field import DEGREES, Boundary, VoxelField
+from nerif.forward.path_integral import PathIntegral, project
+from nerif.forward.registry import forward_models
 from nerif.geometry import Box, Grid
 from nerif.geometry.body import contained
 from nerif.geometry.symmetry import Symmetry
@@ -149,3 +152,32 @@ def test_harmonics_change_around_the_axis_and_not_on_it():
 def test_gradient_heads_with_harmonics_are_refused():
     with refused("gradient_head"):
         network_in(BOX, NetworkShape(depth=1, width=4, gradient_head=True), symmetry=symmetry("axis+1"))
+
+
+def test_the_parts_of_a_sum_add_up():
+    p, total = points(60), STORED["sum"].to("cpu")
+    value, gradient = total.value_and_gradient(p)
+    torch.testing.assert_close(value, sum(part(p) for part in PARTS))
+    torch.testing.assert_close(gradient, sum(part.gradient(p) for part in PARTS))
+
+
+@pytest.mark.parametrize("model", ["lever_arm", "curved"])
+def test_views_of_a_sum_are_the_path_integrals_of_the_whole(measurement, model, monkeypatch):
+    box, grid = measurement.box, Grid(measurement.box, (9, 11, 14))
+    splines = VoxelField.through(make_phantom("gaussians", box, 3).sample(grid), grid)
+    net = network_in(box, NetworkShape(width=16)).eval().requires_grad_(False)
+    total = SumField(NeuralField(net, box, 2e-4), splines)
+    assert symmetry_of_field(total) is None
+    exact = PathIntegral(forward_models(measurement.techniques, measurement, model)[0], 400)
+    rays = measurement.rays()[0]
+    expected = project(exact, total, rays)
+    views = reproject(total, measurement, model=model)
+    inside = measurement.usable & measurement.sees_box
+    scale = float(expected.square().mean().sqrt())
+    assert float((views.predicted[inside] - expected).square().mean().sqrt()) < 0.003 * scale
+    monkeypatch.setattr("nerif.analysis.prediction.EXACT_WORK", {"cpu": 0.0})
+    sampled = reproject(total, measurement, model=model)
+    assert float((sampled.predicted[inside] - expected).square().mean().sqrt()) < 0.02 * scale
+    assert 0 < sampled.accuracies[0].error < 0.02 * scale
+    ideal = predict(total, measurement.cameras, box, 1.00027, model).displacement[inside]
+    assert float((ideal - expected).square().mean().sqrt()) < 0.003 * scale
