@@ -12,7 +12,7 @@ from html import unescape
 from pathlib import Path
 from typing import Any
 
-from nicegui import Client, app, ui
+from nicegui import Client, app, core, ui
 from nicegui.testing import User
 from nicegui.testing.user_simulation import user_simulation
 
@@ -128,20 +128,23 @@ async def visiting(folder: Path) -> AsyncIterator[Visitor]:
     """Serve a project to a simulated user; its runs are started, and no page may raise an error."""
     errors: list[Exception] = []
     work = Workspace(ProjectFolder(folder))
-    async with user_simulation(lambda: None) as user:
-        for page in PAGES:
-            ui.page(page.path, response_timeout=30)(_handler(work, page))
-        for path, handler in routes(work).items():
-            app.add_api_route(path, handler)
-        app.timer(0.2, work.jobs.advance)
-        app.on_exception(errors.append)
-        try:
-            yield Visitor(user, work)
-        finally:
-            for client in list(Client.instances.values()):
-                client.delete()
-            await asyncio.sleep(0.1)  # their tasks end
-            Client.page_routes.clear()  # else the modules of the pages would be imported again
+    try:
+        async with user_simulation(lambda: None) as user:
+            for page in PAGES:
+                ui.page(page.path, response_timeout=30)(_handler(work, page))
+            for path, handler in routes(work).items():
+                app.add_api_route(path, handler)
+            app.timer(0.2, work.jobs.advance)
+            app.on_exception(errors.append)
+            try:
+                yield Visitor(user, work)
+            finally:
+                for client in list(Client.instances.values()):
+                    client.delete()
+                await asyncio.sleep(0.1)  # their tasks end
+                Client.page_routes.clear()  # else the modules of the pages would be imported again
+    finally:
+        core.reset()  # the loop of this test is no one else's
     assert errors == []
 
 
