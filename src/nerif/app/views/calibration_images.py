@@ -105,8 +105,8 @@ class CalibrationImages:
         if detection is not None:
             count, marks = f"{len(detection.points)} points found", _marks(detection, shape)
             error = ", not used" if errors else ""
-        if error := errors.get(name):
-            error = f", rms <b>{error.rms:.3f} px</b>{'' if error.used else ', did not fit'}"
+        if image := errors.get(name):
+            error = f", rms <b>{image.rms:.3f} px</b>{'' if image.used else ', did not fit'}"
         with ui.element("div").classes("target") as cell:
             img = f'<img src="{address}" alt="{escape(f"{name}, {count}")}">'
             caption = f"<figcaption><b>{escape(name)}</b><br>{count}{error}</figcaption>"
