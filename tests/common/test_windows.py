@@ -39,7 +39,7 @@ import functools, multiprocessing, os, signal, sys, types, warnings
 if __name__ == "__main__":
     # first all packages of others: on Windows they have other code
     import cv2, h5netcdf, matplotlib.figure, numba, PIL.Image, psutil, pydantic, rich.progress, scipy.stats
-    import torch, xarray
+    import distributed, torch, xarray
 
     # a file that is open or mapped can be neither replaced, renamed nor removed
     def closed_only(change, *paths, **more):
@@ -62,8 +62,11 @@ if __name__ == "__main__":
     psutil.Process.memory_info = lambda process: types.SimpleNamespace(peak_wset=1 << 30)
     multiprocessing.get_all_start_methods = lambda: ["spawn"]
     warnings.filterwarnings("error", category=EncodingWarning, module=r"nerif\\.")
+    sys.modules["msvcrt"] = types.SimpleNamespace(LK_LOCK=1, LK_NBLCK=2, locking=lambda *_: None)
     from nerif.cli.cli import main
+    from nerif.common import locks
 
+    locks.WINDOWS = True
     for words in COMMANDS:
         if code := main(words):
             sys.exit(f"{words!a} ended with {code}")
