@@ -1,5 +1,37 @@
 """The type checker that holds shapes and types while testing; an int may stand for a float, as everywhere in Python."""
 
+from __future__ import annotations
+
+import ast
+import functools
+import inspect
+import sys
+from collections.abc import Callable
+from types import ModuleType
+from typing import Any
+
 from beartype import BeartypeConf, beartype
 
-check = beartype(conf=BeartypeConf(is_pep484_tower=True))
+HOLD = beartype(conf=BeartypeConf(is_pep484_tower=True))
+
+
+def check(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Check a function from its first call on, when what its module imports for type checkers can be imported."""
+    held: list[Callable[..., Any]] = []
+
+    @functools.wraps(function)
+    def call(*arguments: Any, **named: Any) -> Any:
+        if not held:
+            _import_for_checkers(sys.modules[function.__module__])
+            held.append(HOLD(function))
+        return held[0](*arguments, **named)
+
+    return call
+
+
+@functools.cache
+def _import_for_checkers(module: ModuleType) -> None:
+    """Import the names below `if TYPE_CHECKING`."""
+    for node in ast.parse(inspect.getsource(module)).body:
+        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
+            exec(compile(ast.Module(node.body, []), module.__file__ or "", "exec"), vars(module))
