@@ -12,19 +12,19 @@ from typing import Any
 
 from beartype import BeartypeConf, beartype
 
-HOLD = beartype(conf=BeartypeConf(is_pep484_tower=True))
+CHECKER = beartype(conf=BeartypeConf(is_pep484_tower=True))
 
 
 def check(function: Callable[..., Any]) -> Callable[..., Any]:
     """Check a function from its first call on, when what its module imports for type checkers can be imported."""
-    held: list[Callable[..., Any]] = []
+    checked: list[Callable[..., Any]] = []
 
     @functools.wraps(function)
     def call(*arguments: Any, **named: Any) -> Any:
-        if not held:
+        if not checked:
             _import_for_checkers(sys.modules[function.__module__])
-            held.append(HOLD(function))
-        return held[0](*arguments, **named)
+            checked.append(CHECKER(function))
+        return checked[0](*arguments, **named)
 
     return call
 

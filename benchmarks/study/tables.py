@@ -51,8 +51,10 @@ def _accuracy(results: Results) -> list[str]:
         blocks += [f"### {title}", *([BOUND] if name == "bound" else [])]
         for columns in (FIRST, SECOND):
             head = ["Phantom", *(f"{method} {noise:g}" for method, noise in columns)]
-            rows = [[p, *(_cell(results.cell(p, n, m), name, paper_value(paper, p, m, n), form) for m, n in columns)]
-                    for p in PHANTOMS]
+            rows = [
+                [p, *(_cell(results.cell(p, n, m), name, paper_value(paper, p, m, n), form) for m, n in columns)]
+                for p in PHANTOMS
+            ]
             blocks.append(table(head, rows, left=1))
     return blocks
 

@@ -66,7 +66,8 @@ CAUSES = {
 """Causes by the names of their patterns (residuals.py)."""
 
 SYMMETRY = Remedy(
-    "one camera determines a symmetric flow only: --symmetry axis, or planar, with --axis-direction X Y Z", "symmetry",
+    "one camera determines a symmetric flow only: --symmetry axis, or planar, with --axis-direction X Y Z",
+    "symmetry",
     ("axis", "planar"),
 )
 CHECK = Remedy("nerif check finds swapped u and v, wrong signs, and mirrored or exchanged images")

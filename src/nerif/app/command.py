@@ -57,9 +57,7 @@ class App(Settings):
                     field="allowed_host",
                 )
         if self.root_path and not re.fullmatch(r"(/[\w.~@%+-]+)+/?", self.root_path, re.ASCII):
-            raise InputError(
-                f"expected a path such as /user/me/proxy/8620, got '{self.root_path}'", field="root_path"
-            )
+            raise InputError(f"expected a path such as /user/me/proxy/8620, got '{self.root_path}'", field="root_path")
         if self.token is not None and not re.fullmatch(r"[\w.~-]{16,}", self.token, re.ASCII):
             raise InputError(
                 f"expected 16 or more of A-Z a-z 0-9 _ . ~ -, got {len(self.token)} characters", field="token"

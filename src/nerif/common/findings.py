@@ -10,24 +10,15 @@ __all__ = ["Finding"]
 
 @dataclass(frozen=True)
 class Finding:
-    """A fault of a measurement.
-
-    Parameters
-    ----------
-    code : its kind, one word.
-        Rig: inside, beside, apart, small_box, large_box, moved.
-        All views: unrelated, reordered, or one of the codes of a view.
-        One view: swapped, flipped, flipped_u, flipped_v, mirrored, upside_down, turned, transposed, quarter_turn,
-        reversed_columns, reversed_rows, reversed_axes, exchanged, misscaled, unlike.
-        Flow: open_face
-        Film: late
-    sentence : description and remedy
-    views : names of the views concerned; empty for the whole measurement
-    """
+    """A fault of a measurement."""
 
     code: str
-    sentence: str
-    views: tuple[str, ...] = ()
+    """Its kind, one word. Rig: inside, beside, apart, small_box, large_box, moved. All views: unrelated, reordered,
+    or one of the codes of a view. One view: swapped, flipped, flipped_u, flipped_v, mirrored, upside_down,
+    turned, transposed, quarter_turn, reversed_columns, reversed_rows, reversed_axes, exchanged, misscaled,
+    unlike. Flow: open_face Film: late."""
+    sentence: str  #: description and remedy
+    views: tuple[str, ...] = ()  #: names of the views concerned; empty for the whole measurement
 
     def __str__(self) -> str:
         return self.sentence

@@ -142,24 +142,14 @@ def with_present_names(entries: Mapping[str, Any]) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Option:
-    """A field of settings, or of settings within them.
+    """A field of settings, or of settings within them."""
 
-    Parameters
-    ----------
-    name : network.width for the field `width` of the record `network`
-    place : names of the fields that lead to it
-    hint : type, with choices and limits
-    default : MISSING if it is required
-    marks : of the field, such as Developer
-    owner : class that has the field
-    """
-
-    name: str
-    place: tuple[str, ...]
-    hint: Any
-    default: Any
-    marks: tuple[Any, ...]
-    owner: type
+    name: str  #: network.width for the field `width` of the record `network`
+    place: tuple[str, ...]  #: names of the fields that lead to it
+    hint: Any  #: type, with choices and limits
+    default: Any  #: MISSING if it is required
+    marks: tuple[Any, ...]  #: of the field, such as Developer
+    owner: type  #: class that has the field
 
     @property
     def flag(self) -> str:

@@ -48,16 +48,10 @@ def known_conventions(conventions: object) -> bool:
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of file or folder.
+    """A kind of file or folder."""
 
-    Parameters
-    ----------
-    name : in words, with article
-    use : what to do with it, with the command; {path} and {parent} stand for it and its folder
-    """
-
-    name: str
-    use: str
+    name: str  #: in words, with article
+    use: str  #: what to do with it, with the command; {path} and {parent} stand for it and its folder
 
 
 DISPLACEMENT = "nerif displacement {} --calibration calibration.toml -o m.nc"

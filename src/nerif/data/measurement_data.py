@@ -33,18 +33,12 @@ Data = TypeVar("Data", bound="MeasurementData")
 
 @dataclass(frozen=True)
 class Observation:
-    """The maps of all views by one technique.
+    """The maps of all views by one technique."""
 
-    Parameters
-    ----------
-    technique : quantity that a pixel measures
-    values : (view, row, column, c) in the unit of the technique; NaN: no data
-    sigma : (view, row, column, c) standard deviation of the noise, or None
-    """
-
-    technique: type[ForwardModel]
-    values: Float[Tensor, "view row column c"]
+    technique: type[ForwardModel]  #: quantity that a pixel measures
+    values: Float[Tensor, "view row column c"]  #: (view, row, column, c) in the unit of the technique; NaN: no data
     sigma: Float[Tensor, "view row column c"] | None = None
+    """(view, row, column, c) standard deviation of the noise, or None."""
 
     @classmethod
     def of(cls, technique: type[ForwardModel], maps: Mapping[str, Tensor]) -> Observation:

@@ -83,16 +83,10 @@ def add_frames(
 
 @dataclass(frozen=True)
 class MeasurementSequence:
-    """A measurement for every instant, on disk.
+    """A measurement for every instant, on disk."""
 
-    Parameters
-    ----------
-    path : of the Zarr store
-    times : of the frames, s, increasing
-    """
-
-    path: Path
-    times: tuple[float, ...]
+    path: Path  #: of the Zarr store
+    times: tuple[float, ...]  #: of the frames, s, increasing
 
     def __len__(self) -> int:
         return len(self.times)

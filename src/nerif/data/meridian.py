@@ -33,19 +33,13 @@ DOUBLE_PRECISION = ("n",)  # single precision has too few digits of n - 1
 
 @dataclass(frozen=True)
 class Meridian:
-    """Quantities over (r, h).
+    """Quantities over (r, h)."""
 
-    Parameters
-    ----------
-    r, h : (n), (m) distance from the axis, and along it from its point, mm
-    quantities : (m, n) by name, in the units of volumes; NaN outside the box and in masked voxels
-    axial : axisymmetric, not planar
-    """
-
-    r: np.ndarray
-    h: np.ndarray
+    r: np.ndarray  #: (n) distance from the axis, mm
+    h: np.ndarray  #: (m) coordinate along the axis from its point, mm
     quantities: dict[str, np.ndarray]
-    axial: bool = True
+    """(m, n) by name, in the units of volumes; NaN outside the box and in masked voxels."""
+    axial: bool = True  #: axisymmetric, not planar
 
     @classmethod
     def of(cls, volumes: Mapping[str, Volume], symmetry: Symmetry) -> Meridian:

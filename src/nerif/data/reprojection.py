@@ -23,20 +23,13 @@ __all__ = ["Accuracy", "Reprojection"]
 
 @dataclass(frozen=True)
 class Accuracy:
-    """Method and accuracy of a prediction.
+    """Method and accuracy of a prediction."""
 
-    Parameters
-    ----------
-    technique : quantity that a pixel measures
-    method : in words
-    error : rms difference from the path integral through the field over some pixels, in the technique's unit
-    pixels : number compared; 0 if the prediction is that integral
-    """
-
-    technique: type[ForwardModel]
-    method: str = "the path integral through the field on every pixel"
+    technique: type[ForwardModel]  #: quantity that a pixel measures
+    method: str = "the path integral through the field on every pixel"  #: in words
     error: float = 0.0
-    pixels: int = 0
+    """Rms difference from the path integral through the field over some pixels, in the technique's unit."""
+    pixels: int = 0  #: number compared; 0 if the prediction is that integral
 
     @property
     def sentence(self) -> str:
@@ -57,20 +50,14 @@ class Accuracy:
 
 @dataclass(frozen=True)
 class Reprojection:
-    """A measurement, and its prediction from the reconstructed field.
-
-    Parameters
-    ----------
-    maps : (view, row, column, c) predicted values, by the name of the technique; 0 where a ray misses the box, NaN
-        where a pixel sees a body
-    withheld : names of the views withheld from the reconstruction
-    accuracies : of the prediction by technique; empty if unknown (from a file)
-    """
+    """A measurement, and its prediction from the reconstructed field."""
 
     measurement: Measurement
     maps: Mapping[str, Float[Tensor, "view row column c"]]
-    withheld: tuple[str, ...] = ()
-    accuracies: tuple[Accuracy, ...] = ()
+    """(view, row, column, c) predicted values, by the name of the technique; 0 where a ray misses the box, NaN where
+    a pixel sees a body."""
+    withheld: tuple[str, ...] = ()  #: names of the views withheld from the reconstruction
+    accuracies: tuple[Accuracy, ...] = ()  #: of the prediction by technique; empty if unknown (from a file)
 
     @property
     def predicted(self) -> Float[Tensor, "view row column c"]:

@@ -19,20 +19,13 @@ __all__ = ["SurfaceMap"]
 
 @dataclass(frozen=True)
 class SurfaceMap:
-    """Quantities at the vertices of triangles; NaN where they are unknown, as outside the box.
+    """Quantities at the vertices of triangles; NaN where they are unknown, as outside the box."""
 
-    Parameters
-    ----------
-    vertices : (n, 3) mm, world frame
-    faces : (m, 3) vertices of each triangle
-    quantities : (n,) by name, such as density
-    attributes : numbers and texts of the result, such as n_ambient
-    """
-
-    vertices: Float[Tensor, "n 3"]
-    faces: Int[Tensor, "m 3"]
-    quantities: dict[str, Float[Tensor, " n"]]
+    vertices: Float[Tensor, "n 3"]  #: (n, 3) mm, world frame
+    faces: Int[Tensor, "m 3"]  #: (m, 3) vertices of each triangle
+    quantities: dict[str, Float[Tensor, " n"]]  #: (n,) by name, such as density
     attributes: dict[str, float | str] = field(default_factory=dict)
+    """Numbers and texts of the result, such as n_ambient."""
 
     def write(self, path: str | os.PathLike[str]) -> None:
         """Write a file for ParaView (.vtp) or NetCDF-4 (.nc), atomically."""

@@ -39,24 +39,16 @@ REFERENCES = "Y. He et al., Neural refractive index field, arXiv:2409.14722"
 
 @dataclass(frozen=True, repr=False)
 class Volume:
-    """One quantity on a voxel grid.
+    """One quantity on a voxel grid."""
 
-    Parameters
-    ----------
-    values : (z, y, x) at voxel centres, in `unit`
-    grid : Grid, mm
-    quantity : name, such as index_excess
-    unit : of the values
-    attributes : numbers and texts of the whole result, such as n_ambient
-    notes : those of this quantity, such as assumptions and the number of masked voxels
-    """
-
-    values: Float[Tensor, "z y x"]
-    grid: Grid
-    quantity: str = "index_excess"
-    unit: str = "1"
+    values: Float[Tensor, "z y x"]  #: (z, y, x) at voxel centres, in `unit`
+    grid: Grid  #: Grid, mm
+    quantity: str = "index_excess"  #: name, such as index_excess
+    unit: str = "1"  #: of the values
     attributes: dict[str, float | str] = field(default_factory=dict)
+    """Numbers and texts of the whole result, such as n_ambient."""
     notes: dict[str, float | str] = field(default_factory=dict)
+    """Those of this quantity, such as assumptions and the number of masked voxels."""
 
     def __post_init__(self) -> None:
         make_tensors(self, torch.float32, "values")

@@ -33,17 +33,13 @@ Store = TypeVar("Store", bound="VolumeSequence")
 
 @dataclass(frozen=True)
 class StoredViewScores:
-    """Agreement of the re-projection with the views by one technique, on disk.
+    """Agreement of the re-projection with the views by one technique, on disk."""
 
-    Parameters
-    ----------
-    technique : quantity that a pixel measures
-    cc, rms : (time, view) correlation, and rms difference in the unit of the technique (zarr.Array); NaN: no data
-    """
-
-    technique: type[ForwardModel]
+    technique: type[ForwardModel]  #: quantity that a pixel measures
     cc: Any
+    """(time, view) correlation, zarr.Array; NaN: no data."""
     rms: Any
+    """(time, view) rms difference in the unit of the technique, zarr.Array; NaN: no data."""
 
 
 def score_names(kinds: Sequence[type[ForwardModel]]) -> dict[type[ForwardModel], tuple[str, str]]:

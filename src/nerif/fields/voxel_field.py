@@ -113,15 +113,10 @@ class Boundary:
 
     On an ambient face they are mirrored with opposite sign, so that the field is 0 there; on other faces they are
     mirrored, so that its slope is 0.
-
-    Parameters
-    ----------
-    ambient_faces : names such as "x-"
-    around : whether the field is periodic along y, as of an angle
     """
 
-    ambient_faces: tuple[str, ...] = ()
-    around: bool = False
+    ambient_faces: tuple[str, ...] = ()  #: names such as "x-"
+    around: bool = False  #: whether the field is periodic along y, as of an angle
 
     def __post_init__(self) -> None:
         parse_faces(self.ambient_faces)

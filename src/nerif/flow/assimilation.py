@@ -71,23 +71,14 @@ class FitState:
 
 @dataclass(frozen=True)
 class FitIterate:
-    """Figures of an iteration.
+    """Figures of an iteration."""
 
-    Parameters
-    ----------
-    what : velocity, density, or deviations
-    stage, stages : number of the stage from 0, and their count
-    iterations : so far
-    seconds : so far
-    misfit : rms of residual / sigma, of density that of the displacements
-    """
-
-    what: str
-    stage: int
-    stages: int
-    iterations: int
-    seconds: float
-    misfit: float
+    what: str  #: velocity, density, or deviations
+    stage: int  #: its number, from 0
+    stages: int  #: their count
+    iterations: int  #: so far
+    seconds: float  #: so far
+    misfit: float  #: rms of residual / sigma, of density that of the displacements
 
 
 @dataclass(frozen=True)

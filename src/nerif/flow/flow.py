@@ -14,50 +14,30 @@ __all__ = ["Flow", "FlowDeviations"]
 
 @dataclass(frozen=True)
 class FlowDeviations:
-    """Standard deviations of velocity and pressure, on a grid of their own.
+    """Standard deviations of velocity and pressure, on a grid of their own."""
 
-    Parameters
-    ----------
-    grid : voxels, mm
-    velocity : of the components, mm/s
-    pressure : mm^2/s^2; None: not determined by the physics
-    """
-
-    grid: Grid
-    velocity: Float[Tensor, "t 3 z y x"]
-    pressure: Float[Tensor, "t z y x"] | None
+    grid: Grid  #: voxels, mm
+    velocity: Float[Tensor, "t 3 z y x"]  #: of the components, mm/s
+    pressure: Float[Tensor, "t z y x"] | None  #: mm^2/s^2; None: not determined by the physics
 
 
 @dataclass(frozen=True)
 class Flow:
-    """Velocity and pressure on a grid at the instants of a film.
+    """Velocity and pressure on a grid at the instants of a film."""
 
-    Parameters
-    ----------
-    grid : voxels, mm
-    velocity : along x, y, z, mm/s
-    pressure : over the reference density, up to a constant, mm^2/s^2; None: not determined by the physics
-    transport : residual of the transport of theta in each interval, 1/s
-    momentum : change of momentum that the equations do not explain in each interval, mm/s^2; None as above
-    determined : voxels in which the density is carried, so that the velocity is known
-    misfit : rms of residual / sigma
-    unexplained : rms of `momentum` over that of the acceleration of the fluid, in `determined`; None as above
-    theta : of the film, if it was improved
-    deviations : of velocity and pressure, if computed
-    falling : whether the residual was still falling when the fit ended
-    iterations, seconds : of the fit
-    """
-
-    grid: Grid
-    velocity: Float[Tensor, "t 3 z y x"]
+    grid: Grid  #: voxels, mm
+    velocity: Float[Tensor, "t 3 z y x"]  #: along x, y, z, mm/s
     pressure: Float[Tensor, "t z y x"] | None
-    transport: Float[Tensor, "k z y x"]
+    """Over the reference density, up to a constant, mm^2/s^2; None: not determined by the physics."""
+    transport: Float[Tensor, "k z y x"]  #: residual of the transport of theta in each interval, 1/s
     momentum: Float[Tensor, "k 3 z y x"] | None
-    determined: Bool[Tensor, "t z y x"]
-    misfit: float
+    """Change of momentum that the equations do not explain in each interval, mm/s^2; None as above."""
+    determined: Bool[Tensor, "t z y x"]  #: voxels in which the density is carried, so that the velocity is known
+    misfit: float  #: rms of residual / sigma
     unexplained: float | None = None
-    theta: Float[Tensor, "t z y x"] | None = None
-    deviations: FlowDeviations | None = None
-    falling: bool = False
-    iterations: int = 0
-    seconds: float = 0.0
+    """Rms of `momentum` over that of the acceleration of the fluid, in `determined`; None as above."""
+    theta: Float[Tensor, "t z y x"] | None = None  #: of the film, if it was improved
+    deviations: FlowDeviations | None = None  #: of velocity and pressure, if computed
+    falling: bool = False  #: whether the residual was still falling when the fit ended
+    iterations: int = 0  #: of the fit
+    seconds: float = 0.0  #: of the fit

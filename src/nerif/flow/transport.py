@@ -35,19 +35,12 @@ BISECTIONS = 20
 
 @dataclass(frozen=True)
 class Path:
-    """Paths of fluid over an interval that begin and end in the box.
+    """Paths of fluid over an interval that begin and end in the box."""
 
-    Parameters
-    ----------
-    place : voxel halfway, of all in the volume
-    inside : which of the points of the interval have such a path
-    start, end : x, y, z in voxels from the second layer beyond the faces
-    """
-
-    place: Int[Tensor, n]
-    inside: Bool[Tensor, m]
-    start: Float[Tensor, "n 3"]
-    end: Float[Tensor, "n 3"]
+    place: Int[Tensor, n]  #: voxel halfway, of all in the volume
+    inside: Bool[Tensor, m]  #: which of the points of the interval have such a path
+    start: Float[Tensor, "n 3"]  #: x, y, z in voxels from the second layer beyond the faces
+    end: Float[Tensor, "n 3"]  #: likewise
 
 
 class Transport:

@@ -1,7 +1,7 @@
 """Projections of cameras: perspective and telecentric.
 
-    perspective    (x, y) = (X/Z, Y/Z)    rays through the optical centre; K holds focal lengths, px
-    telecentric    (x, y) = (X, Y)        rays parallel to the optical axis; K holds px per mm
+perspective    (x, y) = (X/Z, Y/Z)    rays through the optical centre; K holds focal lengths, px
+telecentric    (x, y) = (X, Y)        rays parallel to the optical axis; K holds px per mm
 """
 
 from __future__ import annotations

@@ -29,20 +29,13 @@ MIN_POINTS = {"polygon": 3, "brush": 1}
 
 @dataclass(frozen=True)
 class MaskShape:
-    """A shape drawn in a view.
+    """A shape drawn in a view."""
 
-    Parameters
-    ----------
-    kind : polygon or brush
-    points : (column, row) of corners, or along the stroke, px; the centre of the top-left pixel is (0, 0)
-    inside : whether it adds flow or removes it
-    width : of a brush, px
-    """
-
-    kind: str
+    kind: str  #: polygon or brush
     points: tuple[tuple[float, float], ...]
-    inside: bool = True
-    width: Positive = 8.0
+    """(column, row) of corners, or along the stroke, px; the centre of the top-left pixel is (0, 0)."""
+    inside: bool = True  #: whether it adds flow or removes it
+    width: Positive = 8.0  #: of a brush, px
 
     def __post_init__(self) -> None:
         if self.kind not in MIN_POINTS:

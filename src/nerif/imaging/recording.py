@@ -111,25 +111,16 @@ def join_views(views: Iterable[ViewMeasurement], scene: Scene, images: bool = Fa
 
 @dataclass(frozen=True)
 class Recording:
-    """Images of all views, and the settings to evaluate them.
+    """Images of all views, and the settings to evaluate them."""
 
-    Parameters
-    ----------
-    views : of views.find_views
-    cameras : calibrated, by the names of the views (importers.import_cameras, cameras_file.read_cameras)
-    method : of the displacements
-    masks : of the flow, or None; drawn masks take precedence
-    references : most reference images to use; 0 for all
-    images : whether a measurement of one flow image includes the images
-    """
-
-    views: tuple[View, ...]
+    views: tuple[View, ...]  #: of views.find_views
     cameras: Mapping[str, CalibratedCamera]
+    """Calibrated, by the names of the views (importers.import_cameras, cameras_file.read_cameras)."""
     scene: Scene
-    method: DisplacementSettings = field(default_factory=DisplacementSettings)
-    masks: MaskSettings | None = None
-    references: Annotated[int, Ge(0)] = 100
-    images: bool = True
+    method: DisplacementSettings = field(default_factory=DisplacementSettings)  #: of the displacements
+    masks: MaskSettings | None = None  #: of the flow, or None; drawn masks take precedence
+    references: Annotated[int, Ge(0)] = 100  #: most reference images to use; 0 for all
+    images: bool = True  #: whether a measurement of one flow image includes the images
 
     def __post_init__(self) -> None:
         for view in self.views:
@@ -156,27 +147,17 @@ class Recording:
 
 @dataclass(frozen=True)
 class ViewReference:
-    """A view with its camera and its evaluated reference images.
-
-    Parameters
-    ----------
-    masks : settings of the flow mask by threshold, or None
-    region : where the background is visible, or None
-    drawn_mask : drawn flow mask, or None
-    images : whether a displacement map includes the images
-    others : views whose images may have been exchanged with those of this one
-    repeats : how the background repeats, or None
-    """
+    """A view with its camera and its evaluated reference images."""
 
     view: View
     camera: Camera
     reference: Reference
-    masks: MaskSettings | None = None
-    region: PixelMask | None = None
-    drawn_mask: PixelMask | None = None
-    images: bool = True
-    others: tuple[View, ...] = ()
-    repeats: Repetition | None = None
+    masks: MaskSettings | None = None  #: settings of the flow mask by threshold, or None
+    region: PixelMask | None = None  #: where the background is visible, or None
+    drawn_mask: PixelMask | None = None  #: drawn flow mask, or None
+    images: bool = True  #: whether a displacement map includes the images
+    others: tuple[View, ...] = ()  #: views whose images may have been exchanged with those of this one
+    repeats: Repetition | None = None  #: how the background repeats, or None
 
     @classmethod
     def of(

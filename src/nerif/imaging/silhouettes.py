@@ -48,31 +48,19 @@ HULL_VOXELS = 96
 
 @dataclass(frozen=True)
 class BodyPose:
-    """A refined pose, and how well it is known.
+    """A refined pose, and how well it is known."""
 
-    Parameters
-    ----------
-    body : there
-    rotation : (3, 3) R and
-    translation : (3,) t of x' = R x + t, from where it was, mm
-    turn : (3,) of the body about its centre, rad
-    shift : (3,) of its centre, mm
-    sigma : (6,) standard deviations of turn (rad) and shift (mm)
-    unknown : turns about x, y, z and shifts along x, y, z of which the outlines say little, such as a turn of a cone
-        about its axis
-    residual : rms distance of the outline, px
-    points : of the outline
-    """
-
-    body: Body
-    rotation: Matrix3
-    translation: Float[Tensor, 3]
-    turn: Float[Tensor, 3]
-    shift: Float[Tensor, 3]
-    sigma: Float[Tensor, 6]
+    body: Body  #: there
+    rotation: Matrix3  #: (3, 3) R and
+    translation: Float[Tensor, 3]  #: (3,) t of x' = R x + t, from where it was, mm
+    turn: Float[Tensor, 3]  #: (3,) of the body about its centre, rad
+    shift: Float[Tensor, 3]  #: (3,) of its centre, mm
+    sigma: Float[Tensor, 6]  #: (6,) standard deviations of turn (rad) and shift (mm)
     unknown: tuple[str, ...]
-    residual: float
-    points: int
+    """Turns about x, y, z and shifts along x, y, z of which the outlines say little, such as a turn of a cone about
+    its axis."""
+    residual: float  #: rms distance of the outline, px
+    points: int  #: of the outline
 
     @property
     def sentence(self) -> str:

@@ -82,32 +82,20 @@ class State:
 
 @dataclass(frozen=True)
 class Step:
-    """The progress of a method after a step.
+    """The progress of a method after a step."""
 
-    Parameters
-    ----------
-    step, epoch : counts; epoch in passes over all rays
-    seconds : time of the run, earlier parts of a resumed one included
-    progress : from 0 at the start to 1 at the end; of a run that ends by convergence, at the next possible end
-    losses : the terms by name
-    capture : returns the State to resume from
-    field : returns the present Field, valid until the method continues
-    note : a line for the user on a change before this step, or ""
-    pass_steps : average steps per pass over all pixels, of a training
-    rig : returns the present corrections of the cameras (refinement.py); none if they are not refined
-    """
-
-    step: int
-    epoch: float
-    seconds: float
-    progress: float
-    losses: dict[str, float]
+    step: int  #: number done
+    epoch: float  #: passes over all rays
+    seconds: float  #: time of the run, earlier parts of a resumed one included
+    progress: float  #: from 0 at the start to 1 at the end; of a run that ends by convergence, at the next possible end
+    losses: dict[str, float]  #: the terms by name
     rays_per_second: float
-    capture: Callable[[], State]
-    field: Callable[[], Field]
-    note: str = ""
-    pass_steps: float = 1.0
+    capture: Callable[[], State]  #: returns the State to resume from
+    field: Callable[[], Field]  #: returns the present Field, valid until the method continues
+    note: str = ""  #: a line for the user on a change before this step, or ""
+    pass_steps: float = 1.0  #: average steps per pass over all pixels, of a training
     rig: Callable[[], list[RefinedView]] = list
+    """Returns the present corrections of the cameras (refinement.py); none if they are not refined."""
 
 
 OnStep = Callable[[Step], bool | None]
@@ -121,37 +109,22 @@ def compose(*callbacks: OnStep) -> OnStep:
 
 @dataclass(frozen=True, repr=False)
 class Reconstruction:
-    """The result of a reconstruction.
-
-    Parameters
-    ----------
-    box : of the field, mm
-    n_ambient : refractive index from which an excess is counted
-    quantity : of the field (volume.QUANTITIES)
-    history : one record per logged step
-    settings : of the method, as plain values
-    seconds : time of the run
-    peak_memory_bytes : on the device (CUDA) or of the process (CPU)
-    state : to resume from, or None
-    rig : corrections of each view (refinement.py)
-    axis : of a symmetric flow, as estimated (symmetry.py); None without symmetry
-    bodies : in the flow; within them the field has no meaning, and volumes are NaN
-    """
+    """The result of a reconstruction."""
 
     field: Field
-    box: Box
-    n_ambient: float
-    history: list[dict[str, float]]
+    box: Box  #: of the field, mm
+    n_ambient: float  #: refractive index from which an excess is counted
+    history: list[dict[str, float]]  #: one record per logged step
     outcome: Outcome
-    settings: dict[str, Any]
-    seconds: float = 0.0
-    peak_memory_bytes: int = 0
+    settings: dict[str, Any]  #: of the method, as plain values
+    seconds: float = 0.0  #: time of the run
+    peak_memory_bytes: int = 0  #: on the device (CUDA) or of the process (CPU)
     device: str = "cpu"
-    state: State | None = dataclasses.field(default=None, repr=False)
-    quantity: str = "index_excess"
-    rig: list[RefinedView] = dataclasses.field(default_factory=list)
-    axis: Axis | None = None
-    bodies: tuple[Body, ...] = ()
+    state: State | None = dataclasses.field(default=None, repr=False)  #: to resume from, or None
+    quantity: str = "index_excess"  #: of the field (volume.QUANTITIES)
+    rig: list[RefinedView] = dataclasses.field(default_factory=list)  #: corrections of each view (refinement.py)
+    axis: Axis | None = None  #: of a symmetric flow, as estimated (symmetry.py); None without symmetry
+    bodies: tuple[Body, ...] = ()  #: in the flow; within them the field has no meaning, and volumes are NaN
 
     @property
     def model(self) -> str:

@@ -66,17 +66,11 @@ class RangeSlider:
 
 @dataclass(frozen=True)
 class SliderScale:
-    """Steps 0 to `last` of a slider between two values, logarithmic if these span decades.
+    """Steps 0 to `last` of a slider between two values, logarithmic if these span decades."""
 
-    Parameters
-    ----------
-    low, high : values of the ends
-    whole : whether the values are whole numbers
-    """
-
-    low: float
-    high: float
-    whole: bool = False
+    low: float  #: value of the left end
+    high: float  #: value of the right end
+    whole: bool = False  #: whether the values are whole numbers
 
     @property
     def last(self) -> int:

@@ -55,9 +55,9 @@ def frame(work: Workspace, page: Page, pages: Sequence[Page]) -> Iterator[None]:
         menu = ui.button(icon="menu").props('flat round aria-label="Pages"')
         folder, name = escape(str(work.project.folder)), escape(work.project.name)
         parent = f"<span class=parent>{folder.removesuffix(name)}</span>"
-        html(
-            f"<span class=brand>nerif</span><span class=project title='{folder}'>{parent}{name}</span>"
-        ).classes("where")
+        html(f"<span class=brand>nerif</span><span class=project title='{folder}'>{parent}{name}</span>").classes(
+            "where"
+        )
         ui.space()
         drawer = JobsDrawer(work)
         _switch(dark)

@@ -154,9 +154,7 @@ class ResultsPage:
                 text_html(f"They are written to {self.row.title}/figures.", classes="note")
                 self._form("figures", Figures(MISSING), lambda: [], "Draw the figures")
 
-    def _file_form(
-        self, verb: str, record: Any, formats: Mapping[str, str], button: str, main: Sequence[str]
-    ) -> None:
+    def _file_form(self, verb: str, record: Any, formats: Mapping[str, str], button: str, main: Sequence[str]) -> None:
         """Build the form of a command that writes a file, with a choice of its format that changes its name."""
 
         def name_with(ending: str) -> str:

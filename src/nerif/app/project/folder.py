@@ -31,24 +31,14 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Contents:
-    """Files of a project as paths relative to its folder, as a command takes them, sorted.
+    """Files of a project as paths relative to its folder, as a command takes them, sorted."""
 
-    Parameters
-    ----------
-    experiments : folders of images that have views
-    calibrations : calibration files (.toml)
-    measurements : measurement files (.nc)
-    results : result directories, also of current runs
-    films : stores over time (.zarr)
-    models : surfaces of bodies (.stl, .obj, .ply)
-    """
-
-    experiments: tuple[str, ...] = ()
-    calibrations: tuple[str, ...] = ()
-    measurements: tuple[str, ...] = ()
-    results: tuple[str, ...] = ()
-    films: tuple[str, ...] = ()
-    models: tuple[str, ...] = ()
+    experiments: tuple[str, ...] = ()  #: folders of images that have views
+    calibrations: tuple[str, ...] = ()  #: calibration files (.toml)
+    measurements: tuple[str, ...] = ()  #: measurement files (.nc)
+    results: tuple[str, ...] = ()  #: result directories, also of current runs
+    films: tuple[str, ...] = ()  #: stores over time (.zarr)
+    models: tuple[str, ...] = ()  #: surfaces of bodies (.stl, .obj, .ply)
 
 
 class ProjectFolder:

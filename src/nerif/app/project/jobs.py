@@ -42,35 +42,20 @@ OPEN = ("running", "queued", "held", "paused")
 
 @dataclass(frozen=True)
 class CommandRun:
-    """One run.
+    """One run."""
 
-    Parameters
-    ----------
-    id : name of its folder; sorts by time
-    title : title for display
-    arguments : arguments of nerif, the verb first
-    attempt : arguments of the present start; after a pause these differ, e.g. by --resume
-    out : result directory relative to the folder; empty if the run writes none
-    request : "", "stop" or "pause"
-    place : sort key in the queue
-    state : held, queued, running, paused, done, failed or stopped
-    pid : process id while it runs
-    code : exit code after the end
-    started, ended : seconds since the epoch, 0 before
-    """
-
-    id: str
-    title: str
-    arguments: tuple[str, ...]
-    attempt: tuple[str, ...]
-    out: str = ""
-    request: str = ""
-    place: float = 0.0
-    state: str = "queued"
-    pid: int = 0
-    code: int | None = None
-    started: float = 0.0
-    ended: float = 0.0
+    id: str  #: name of its folder; sorts by time
+    title: str  #: title for display
+    arguments: tuple[str, ...]  #: arguments of nerif, the verb first
+    attempt: tuple[str, ...]  #: arguments of the present start; after a pause these differ, e.g. by --resume
+    out: str = ""  #: result directory relative to the folder; empty if the run writes none
+    request: str = ""  #: "", "stop" or "pause"
+    place: float = 0.0  #: sort key in the queue
+    state: str = "queued"  #: held, queued, running, paused, done, failed or stopped
+    pid: int = 0  #: process id while it runs
+    code: int | None = None  #: exit code after the end
+    started: float = 0.0  #: seconds since 1970, 0 before
+    ended: float = 0.0  #: likewise
 
     @property
     def line(self) -> str:

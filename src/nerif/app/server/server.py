@@ -44,22 +44,13 @@ FAVICON = (
 
 @dataclass(frozen=True)
 class Address:
-    """Host, port and token of the server.
+    """Host, port and token of the server."""
 
-    Parameters
-    ----------
-    host : name or IP address to listen on
-    port : port to listen on
-    token : token that a browser must send
-    allowed : addresses of tunnels and proxies that lead to the server
-    root : path that a proxy puts in front
-    """
-
-    host: str
-    port: int
-    token: str
-    allowed: tuple[str, ...] = ()
-    root: str = ""
+    host: str  #: name or IP address to listen on
+    port: int  #: port to listen on
+    token: str  #: token that a browser must send
+    allowed: tuple[str, ...] = ()  #: addresses of tunnels and proxies that lead to the server
+    root: str = ""  #: path that a proxy puts in front
 
     @classmethod
     def of(cls, host: str, port: int, token: str | None, allowed: tuple[str, ...] = (), root: str = "") -> Address:

@@ -54,18 +54,11 @@ GROWTH = 1.25  # of the brush, per key
 
 @dataclass
 class Brush:
-    """Tool, effect and width of strokes; they stay from view to view.
+    """Tool, effect and width of strokes; they stay from view to view."""
 
-    Parameters
-    ----------
-    tool : of TOOLS
-    inside : whether the flow is where it draws
-    width : of the brush, px
-    """
-
-    tool: str = "polygon"
-    inside: bool = True
-    width: float | None = 8
+    tool: str = "polygon"  #: of TOOLS
+    inside: bool = True  #: whether the flow is where it draws
+    width: float | None = 8  #: of the brush, px
 
     def resize(self, larger: bool, limit: int) -> None:
         """Change the width by a quarter, at least by one pixel, between 1 and `limit`."""

@@ -30,26 +30,15 @@ CLASSES = {"use": "good", "use with care": "care", "do not use": "bad"}
 
 @dataclass(frozen=True)
 class Row:
-    """One result or film.
+    """One result or film."""
 
-    Parameters
-    ----------
-    name : relative to the project
-    title : name for display
-    cells : cells of the table after the name
-    word : verdict in short
-    sentence : verdict in full, or the missing data
-    figures : names and values of the error estimates
-    film : whether it is a store over time
-    """
-
-    name: str
-    title: str
-    cells: tuple[str, ...]
-    word: str
-    sentence: str
-    figures: tuple[tuple[str, str], ...]
-    film: bool = False
+    name: str  #: relative to the project
+    title: str  #: name for display
+    cells: tuple[str, ...]  #: cells of the table after the name
+    word: str  #: verdict in short
+    sentence: str  #: verdict in full, or the missing data
+    figures: tuple[tuple[str, str], ...]  #: names and values of the error estimates
+    film: bool = False  #: whether it is a store over time
 
 
 def rows_of(project: ProjectFolder, contents: Contents) -> list[Row]:

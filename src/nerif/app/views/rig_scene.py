@@ -26,20 +26,12 @@ HEAD = ("Camera", "Image [px]", "Focal length [px]", "Position x, y, z [mm]", "I
 
 @dataclass(frozen=True)
 class Rig:
-    """Contents of a calibration file.
+    """Contents of a calibration file."""
 
-    Parameters
-    ----------
-    cameras : cameras that can be drawn
-    gaps : data that the other cameras lack
-    box : measurement volume
-    errors : reprojection errors of the calibration images, empty if the file has none
-    """
-
-    cameras: tuple[Camera, ...]
-    gaps: tuple[str, ...]
-    box: Box | None
-    errors: tuple[ImageError, ...]
+    cameras: tuple[Camera, ...]  #: cameras that can be drawn
+    gaps: tuple[str, ...]  #: data that the other cameras lack
+    box: Box | None  #: measurement volume
+    errors: tuple[ImageError, ...]  #: reprojection errors of the calibration images, empty if the file has none
 
 
 def read_rig(path: Path) -> Rig:

@@ -23,22 +23,13 @@ NORMALS = "zyx"
 
 @dataclass(frozen=True)
 class Panel:
-    """A volume and its display settings.
-
-    Parameters
-    ----------
-    title : title
-    volume : volume; all panels of a view have the same grid
-    limits : colour range, in `unit`
-    unit : unit of the values
-    colours : name of a Matplotlib colour map
-    """
+    """A volume and its display settings."""
 
     title: str
-    volume: Volume
-    limits: tuple[float, float]
-    unit: str
-    colours: str
+    volume: Volume  #: volume; all panels of a view have the same grid
+    limits: tuple[float, float]  #: colour range, in `unit`
+    unit: str  #: unit of the values
+    colours: str  #: name of a Matplotlib colour map
 
 
 class SlicesView:

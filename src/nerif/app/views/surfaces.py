@@ -82,22 +82,13 @@ class BoxScene:
 
 @dataclass(frozen=True)
 class Surface:
-    """Source of an isosurface.
+    """Source of an isosurface."""
 
-    Parameters
-    ----------
-    name : result or film, relative to the project
-    title : its name for display
-    frame : frame of a film
-    stamp : value that changes with the file
-    bodies : whether there are bodies in its flow
-    """
-
-    name: str
-    title: str
-    frame: int
-    stamp: int
-    bodies: bool = False
+    name: str  #: result or film, relative to the project
+    title: str  #: its name for display
+    frame: int  #: frame of a film
+    stamp: int  #: value that changes with the file
+    bodies: bool = False  #: whether there are bodies in its flow
 
 
 class SurfaceView:

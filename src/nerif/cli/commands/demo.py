@@ -24,16 +24,10 @@ __all__ = ["DEMOS", "Demo", "main", "run"]
 
 @dataclass(frozen=True)
 class Stage:
-    """A command of a demo.
+    """A command of a demo."""
 
-    Parameters
-    ----------
-    line : of the command, without `nerif`; {out} is the directory, {steps} the number of training steps
-    files : that it writes beside those of a result
-    """
-
-    line: str
-    files: tuple[str, ...] = ()
+    line: str  #: of the command, without `nerif`; {out} is the directory, {steps} the number of training steps
+    files: tuple[str, ...] = ()  #: that it writes beside those of a result
 
     def words(self, out: Path, steps: int) -> list[str]:
         """Return the words of the command."""

@@ -15,16 +15,10 @@ __all__ = ["SAMPLES", "SampleData", "sample"]
 
 @dataclass(frozen=True)
 class SampleData:
-    """A real measurement.
+    """A real measurement."""
 
-    Parameters
-    ----------
-    title : in a few words
-    licence : SPDX identifier
-    """
-
-    title: str
-    licence: str
+    title: str  #: in a few words
+    licence: str  #: SPDX identifier
 
 
 SAMPLES = {

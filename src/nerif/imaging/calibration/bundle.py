@@ -38,16 +38,10 @@ INTRINSIC, POSE = 11, 6  # parameters: fx, fy, cx, cy, five of distortion, two o
 
 @dataclass(frozen=True)
 class Pose:
-    """A rigid motion x -> R x + t.
+    """A rigid motion x -> R x + t."""
 
-    Parameters
-    ----------
-    rotation : (3, 3)
-    translation : (3,) mm
-    """
-
-    rotation: Float[np.ndarray, "3 3"]
-    translation: Float[np.ndarray, 3]
+    rotation: Float[np.ndarray, "3 3"]  #: (3, 3)
+    translation: Float[np.ndarray, 3]  #: (3,) mm
 
     def __matmul__(self, first: Pose) -> Pose:
         """Return the motion `first` followed by this one."""
@@ -90,43 +84,27 @@ class Pose:
 
 @dataclass(frozen=True)
 class TargetObservation:
-    """The target of one image.
+    """The target of one image."""
 
-    Parameters
-    ----------
-    camera, pose : their indices in the bundle
-    image : name of the image
-    on_background : whether the target lay on the camera's background
-    """
-
-    camera: int
-    pose: int
+    camera: int  #: its index in the bundle
+    pose: int  #: its index in the bundle
     detection: Detection
-    image: str = ""
-    on_background: bool = False
+    image: str = ""  #: name of the image
+    on_background: bool = False  #: whether the target lay on the camera's background
 
 
 @dataclass(frozen=True)
 class CameraBundle:
-    """All cameras and target poses.
-
-    Parameters
-    ----------
-    intrinsics : (camera, 11) fx, fy, cx, cy (px; fx, fy of telecentric cameras px/mm), k1, k2, p1, p2, k3, and of the
-        sensor tau_x, tau_y (rad)
-    cameras : world to camera
-    poses : target to world
-    fixed : index of the pose that defines the world
-    free : (11,) which intrinsics are adjusted
-    sizes : (height, width) of each camera's images, px
-    """
+    """All cameras and target poses."""
 
     intrinsics: Float[np.ndarray, "camera 11"]
-    cameras: tuple[Pose, ...]
-    poses: tuple[Pose, ...]
-    fixed: int
-    free: tuple[bool, ...]
-    sizes: tuple[tuple[int, int], ...]
+    """(camera, 11) fx, fy, cx, cy (px; fx, fy of telecentric cameras px/mm), k1, k2, p1, p2, k3, and of the sensor
+    tau_x, tau_y (rad)."""
+    cameras: tuple[Pose, ...]  #: world to camera
+    poses: tuple[Pose, ...]  #: target to world
+    fixed: int  #: index of the pose that defines the world
+    free: tuple[bool, ...]  #: (11,) which intrinsics are adjusted
+    sizes: tuple[tuple[int, int], ...]  #: (height, width) of each camera's images, px
     projection: Projection = PERSPECTIVE
 
     def project(self, o: TargetObservation) -> Float[np.ndarray, "n 2"]:

@@ -25,18 +25,12 @@ MAX_FILL = 0.88  # median area of the dots over that of rectangles around them: 
 
 @dataclass(frozen=True)
 class DotGrid:
-    """A complete grid of dots.
-
-    Parameters
-    ----------
-    centres : of a regular grid, px, columns and rows in the sense of those of an image (not mirrored)
-    count : number of dots
-    asymmetric : every second row is shifted by half a step; the centres are not sorted then
-    """
+    """A complete grid of dots."""
 
     centres: Float[np.ndarray, "row column 2"]
-    count: int
-    asymmetric: bool = False
+    """Of a regular grid, px; columns and rows run as those of an image (not mirrored)."""
+    count: int  #: number of dots
+    asymmetric: bool = False  #: every second row is shifted by half a step; the centres are not sorted then
 
 
 def find_dots(image: np.ndarray, count: int) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, " n"]]:

@@ -92,38 +92,28 @@ class FittedPlane:
 
 @dataclass(frozen=True)
 class Calibration:
-    """Calibrated cameras and their errors.
+    """Calibrated cameras and their errors."""
 
-    Parameters
-    ----------
-    names, sizes : of the cameras and their images (height, width)
-    intrinsics : (camera, 11) as those of a CameraBundle
-    poses : world to camera, mm
-    errors : one per image
-    sigma_rotation, sigma_translation : (camera,) standard deviations from noise alone, degrees and mm; the latter of
-        telecentric cameras across the optical axis
-    sigma_focal : (camera,) relative standard deviation of the focal length or scale
-    sigma_tilt : (camera, 2) standard deviations of the tilt, degrees; 0 where it was not determined
-    residuals : per camera (n, 4) u, v and the residuals in u, v, px
-    pose_sigma : (camera, 6) of a Camera, from noise alone and for the tilt as it is, or None
-    mount : standard deviations of position (mm) and rotation (degrees) to add to those of noise
-    """
-
-    names: tuple[str, ...]
-    sizes: tuple[tuple[int, int], ...]
-    intrinsics: Float[np.ndarray, "camera 11"]
-    poses: tuple[Pose, ...]
+    names: tuple[str, ...]  #: of the cameras
+    sizes: tuple[tuple[int, int], ...]  #: of their images (height, width), px
+    intrinsics: Float[np.ndarray, "camera 11"]  #: (camera, 11) as those of a CameraBundle
+    poses: tuple[Pose, ...]  #: world to camera, mm
     backgrounds: tuple[FittedPlane | None, ...]
-    errors: tuple[ImageError, ...]
+    errors: tuple[ImageError, ...]  #: one per image
     sigma_rotation: Float[np.ndarray, " camera"]
+    """(camera,) standard deviation from noise alone, degrees."""
     sigma_translation: Float[np.ndarray, " camera"]
-    sigma_focal: Float[np.ndarray, " camera"]
+    """(camera,) standard deviation from noise alone, mm; of telecentric cameras across the optical axis."""
+    sigma_focal: Float[np.ndarray, " camera"]  #: (camera,) relative standard deviation of the focal length or scale
     sigma_tilt: Float[np.ndarray, "camera 2"]
-    residuals: tuple[np.ndarray, ...]
+    """(camera, 2) standard deviations of the tilt, degrees; 0 where it was not determined."""
+    residuals: tuple[np.ndarray, ...]  #: per camera (n, 4) u, v and the residuals in u, v, px
     projection: Projection = PERSPECTIVE
     lens: Lens | None = None
     pose_sigma: Float[np.ndarray, "camera 6"] | None = None
+    """(camera, 6) of a Camera, from noise alone and for the tilt as it is, or None."""
     mount: tuple[float, float] = MOUNT
+    """Standard deviations of position (mm) and rotation (degrees) to add to those of noise."""
 
     @classmethod
     def of(

@@ -34,7 +34,6 @@ ROUNDING_TOLERANCE = 1e-6  # in steps of the rounding
 EDGE_TOLERANCE = 1e-9  # of the image
 
 
-
 def find_image(
     source: Path, only: Sequence[str] = (), image_size: tuple[int, int] | None = None
 ) -> tuple[str, tuple[int, int]]:

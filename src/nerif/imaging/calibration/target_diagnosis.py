@@ -43,35 +43,22 @@ OVEREXPOSED = 0.25  # share of the pixels
 
 @dataclass(frozen=True)
 class Identification:
-    """A target that fits an image.
-
-    Parameters
-    ----------
-    target : as in the settings, but for what differs; None if it is one that is not supported
-    mirrored : the image has to be flipped first
-    text : the target in words
-    """
+    """A target that fits an image."""
 
     target: CalibrationTarget | None
-    text: str
-    mirrored: bool = False
+    """As in the settings, but for what differs; None if it is one that is not supported."""
+    text: str  #: the target in words
+    mirrored: bool = False  #: the image has to be flipped first
 
 
 @dataclass(frozen=True)
 class _Markers:
-    """Markers of a family of dictionaries in an image.
+    """Markers of a family of dictionaries in an image."""
 
-    Parameters
-    ----------
-    family : names of the dictionaries with the same first markers, from the smallest
-    corners : px, of each marker clockwise from its upper left one
-    size : height and width of the image, px
-    """
-
-    family: tuple[str, ...]
+    family: tuple[str, ...]  #: names of the dictionaries with the same first markers, from the smallest
     ids: Int[np.ndarray, " n"]
-    corners: Float[np.ndarray, "n 4 2"]
-    size: tuple[int, int]
+    corners: Float[np.ndarray, "n 4 2"]  #: px, of each marker clockwise from its upper left one
+    size: tuple[int, int]  #: height and width of the image, px
 
 
 class _BoardLayout(NamedTuple):

@@ -30,39 +30,23 @@ TURN = np.radians(20.0)  # of a grid of dots in the image, least ambiguous
 
 @dataclass(frozen=True)
 class Detection:
-    """The points of a target in an image.
+    """The points of a target in an image."""
 
-    Parameters
-    ----------
-    ids : (n,) their numbers on the target
-    pixels : (n, 2) their places in the image, px
-    points : (n, 3) their places on the target, mm
-    negative : the target is white on black
-    """
-
-    ids: Int[np.ndarray, " n"]
-    pixels: Float[np.ndarray, "n 2"]
-    points: Float[np.ndarray, "n 3"]
-    negative: bool = False
+    ids: Int[np.ndarray, " n"]  #: (n,) their numbers on the target
+    pixels: Float[np.ndarray, "n 2"]  #: (n, 2) their places in the image, px
+    points: Float[np.ndarray, "n 3"]  #: (n, 3) their places on the target, mm
+    negative: bool = False  #: the target is white on black
 
 
 @dataclass(frozen=True)
 class TargetDetections:
-    """Detections in the images of one camera.
-
-    Parameters
-    ----------
-    size : (height, width) of its images, px
-    poses : the target free in space, by the name of the pose, which cameras share
-    background : the target on the background, by the name of the image
-    diagnosis : why few images of the target have a detection; empty if many have
-    """
+    """Detections in the images of one camera."""
 
     name: str
-    size: tuple[int, int]
-    poses: Mapping[str, Detection]
-    background: Mapping[str, Detection]
-    diagnosis: str = ""
+    size: tuple[int, int]  #: (height, width) of its images, px
+    poses: Mapping[str, Detection]  #: the target free in space, by the name of the pose, which cameras share
+    background: Mapping[str, Detection]  #: the target on the background, by the name of the image
+    diagnosis: str = ""  #: why few images of the target have a detection; empty if many have
 
     def without(self, names: Collection[str]) -> TargetDetections:
         """Return the detections except those in images of these names, such as cam1/target/7."""

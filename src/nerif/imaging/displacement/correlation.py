@@ -33,18 +33,11 @@ MIN_PEAK = 0.1  # of the correlation, which is 1 where both windows are equal
 
 @dataclass(frozen=True)
 class Vectors:
-    """Movements at the centres of windows.
+    """Movements at the centres of windows."""
 
-    Parameters
-    ----------
-    axes : centres along each axis of the arrays, px (in volumes: voxels)
-    movement : (*nodes, d) in px; interpolated from the neighbours where not valid
-    valid : (*nodes) False where the peak is low or the vector is an outlier
-    """
-
-    axes: tuple[np.ndarray, ...]
-    movement: np.ndarray
-    valid: np.ndarray
+    axes: tuple[np.ndarray, ...]  #: centres along each axis of the arrays, px (in volumes: voxels)
+    movement: np.ndarray  #: (*nodes, d) in px; interpolated from the neighbours where not valid
+    valid: np.ndarray  #: (*nodes) False where the peak is low or the vector is an outlier
 
 
 def window_correlation(flow: np.ndarray, reference: np.ndarray, window: int = 16) -> np.ndarray:

@@ -47,25 +47,16 @@ MEGAPIXEL = 2**20  # in images up to this number of pixels
 
 @dataclass(frozen=True)
 class DisplacementMap:
-    """Displacement of one view.
+    """Displacement of one view."""
 
-    Parameters
-    ----------
-    displacement : d, px
-    sigma : standard deviation of its noise, px
-    noise_source : "repeats" (of the reference, and residual) or "structure tensor"
-    pair : the images; None for the mean of several
-    losses : shares of the region's pixels that are not valid, by cause, the largest first
-    shift : of the whole image (u, v) between reference and flow, px; 0 below 4 px
-    """
-
-    displacement: Vectors
-    sigma: Vectors
+    displacement: Vectors  #: d, px
+    sigma: Vectors  #: standard deviation of its noise, px
     valid: PixelMask
-    noise_source: str
-    pair: ImagePair | None = None
+    noise_source: str  #: "repeats" (of the reference, and residual) or "structure tensor"
+    pair: ImagePair | None = None  #: the images; None for the mean of several
     losses: Mapping[str, float] = field(default_factory=dict)
-    shift: tuple[int, int] = (0, 0)
+    """Shares of the region's pixels that are not valid, by cause, the largest first."""
+    shift: tuple[int, int] = (0, 0)  #: of the whole image (u, v) between reference and flow, px; 0 below 4 px
 
     @property
     def loss_text(self) -> str:
@@ -98,27 +89,17 @@ def _displacement_and_shift(
 
 @dataclass(frozen=True)
 class Reference:
-    """Evaluation of the reference frames of a view, common to all its flow frames.
+    """Evaluation of the reference frames of a view, common to all its flow frames."""
 
-    Parameters
-    ----------
-    mean : of the frames
-    overexposed : pixels saturated in any of them
-    full_scale : grey value of a saturated pixel; infinite if unknown
-    averages : number of flow frames whose displacements are averaged
-    noise : of d between repeats: its scatter, and by the structure tensor, px; None with fewer than three frames
-    count : number of frames
-    camera_noise : noise of the grey values; None with fewer than two frames
-    """
-
-    mean: Image
+    mean: Image  #: of the frames
     settings: DisplacementSettings
-    overexposed: PixelMask
-    full_scale: float
-    averages: int
+    overexposed: PixelMask  #: pixels saturated in any of them
+    full_scale: float  #: grey value of a saturated pixel; infinite if unknown
+    averages: int  #: number of flow frames whose displacements are averaged
     noise: tuple[Vectors, Vectors] | None
-    count: int = 1
-    camera_noise: CameraNoise | None = None
+    """Scatter of d between repeats, and by the structure tensor, px; None with fewer than three frames."""
+    count: int = 1  #: number of frames
+    camera_noise: CameraNoise | None = None  #: noise of the grey values; None with fewer than two frames
 
     @classmethod
     def of(

@@ -40,16 +40,10 @@ TRIMMED = 0.99  # share of the pixels, those with the least residual, that deter
 
 @dataclass(frozen=True)
 class CameraNoise:
-    """Noise of a camera.
+    """Noise of a camera."""
 
-    Parameters
-    ----------
-    read : variance without light, grey values squared
-    shot : variance per grey value, grey values
-    """
-
-    read: float
-    shot: float
+    read: float  #: variance without light, grey values squared
+    shot: float  #: variance per grey value, grey values
 
     @classmethod
     def of_repeats(cls, images: Sequence[np.ndarray], mean: Grey, count: int) -> CameraNoise:
@@ -92,18 +86,11 @@ class CameraNoise:
 
 @dataclass(frozen=True)
 class ImagePair:
-    """The images of a view without and with flow.
+    """The images of a view without and with flow."""
 
-    Parameters
-    ----------
-    reference : grey values, mean of all images without flow, warped by the shake of the camera
-    flow : grey values; NaN where saturated or without background
-    sigma : standard deviation of the difference between the flow image and the warped reference, grey values
-    """
-
-    reference: Image
-    flow: Image
-    sigma: Image
+    reference: Image  #: grey values, mean of all images without flow, warped by the shake of the camera
+    flow: Image  #: grey values; NaN where saturated or without background
+    sigma: Image  #: standard deviation of the difference between the flow image and the warped reference, grey values
 
     @classmethod
     def of(

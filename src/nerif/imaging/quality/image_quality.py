@@ -24,32 +24,18 @@ WHITE = 0.999, 1.05  # quantile of the grey values, and ratio of white to it
 
 @dataclass(frozen=True)
 class ImageQuality:
-    """Quality of the images of one source of a view.
+    """Quality of the images of one source of a view."""
 
-    Parameters
-    ----------
-    count : number of images
-    sampled : number of images read
-    shape : height and width of the view's part of a frame, px
-    frame_shape : height and width of a frame, px
-    full : grey value of a saturated pixel
-    saturated : share of saturated pixels in the first good image
-    histogram : share of its pixels per bin from 0 to full scale
-    bad : names of unusable images, and why
-    notes : how the files are read, and warnings about them and of bad exposure
-    first : number of the first good image
-    """
-
-    count: int
-    sampled: int
-    shape: tuple[int, int]
-    frame_shape: tuple[int, int]
-    full: float
-    saturated: float
-    histogram: Float[np.ndarray, " bin"]
-    bad: tuple[tuple[str, str], ...]
-    notes: tuple[str, ...]
-    first: int
+    count: int  #: number of images
+    sampled: int  #: number of images read
+    shape: tuple[int, int]  #: height and width of the view's part of a frame, px
+    frame_shape: tuple[int, int]  #: height and width of a frame, px
+    full: float  #: grey value of a saturated pixel
+    saturated: float  #: share of saturated pixels in the first good image
+    histogram: Float[np.ndarray, " bin"]  #: share of its pixels per bin from 0 to full scale
+    bad: tuple[tuple[str, str], ...]  #: names of unusable images, and why
+    notes: tuple[str, ...]  #: how the files are read, and warnings about them and of bad exposure
+    first: int  #: number of the first good image
 
 
 def image_quality(view: View, source: str, most: int = 12) -> ImageQuality:

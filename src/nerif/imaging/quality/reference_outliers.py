@@ -36,16 +36,10 @@ BLURRED = 1.0  # px, scatter of the shifts from which their mean is blurred
 
 @dataclass(frozen=True)
 class Outliers:
-    """Reference images that differ from the others.
+    """Reference images that differ from the others."""
 
-    Parameters
-    ----------
-    reasons : by the number of the image
-    note : what cannot be decided, or ""
-    """
-
-    reasons: Mapping[int, str]
-    note: str = ""
+    reasons: Mapping[int, str]  #: by the number of the image
+    note: str = ""  #: what cannot be decided, or ""
 
 
 def outliers(

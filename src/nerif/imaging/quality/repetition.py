@@ -33,16 +33,12 @@ ALONG = 8.0  # degrees from an axis of the image within which a direction is nam
 
 @dataclass(frozen=True)
 class Repetition:
-    """The repetition of a background.
-
-    Parameters
-    ----------
-    periods : shortest shifts (x, y) that map the background onto itself, px: two, one of lines, none of random lines
-    lines : unit vector (x, y) along the lines; None if the background changes in all directions
-    """
+    """The repetition of a background."""
 
     periods: tuple[Float[np.ndarray, " 2"], ...]
+    """Shortest shifts (x, y) that map the background onto itself, px: two, one of lines, none of random lines."""
     lines: Float[np.ndarray, " 2"] | None = None
+    """Unit vector (x, y) along the lines; None if the background changes in all directions."""
 
     def __str__(self) -> str:
         parts = [f"every {np.linalg.norm(p):.1f} px {_direction(p)}" for p in self.periods]

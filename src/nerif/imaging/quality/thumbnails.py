@@ -36,20 +36,14 @@ SIGNIFICANT = 8.0  # standard deviations over all shifts; the highest peak of tw
 
 @dataclass(frozen=True)
 class Thumbnail:
-    """An image binned to 256 px or less.
-
-    Parameters
-    ----------
-    detail : grey values minus their local mean, in local standard deviations; 0 in an image of a single grey
-    spectrum : Fourier transform of the detail under a window that fades towards the edges, of norm 1
-    binning : pixels of the image per pixel of the thumbnail
-    grey : mean of the grey values
-    """
+    """An image binned to 256 px or less."""
 
     detail: Float[np.ndarray, "row column"]
+    """Grey values minus their local mean, in local standard deviations; 0 in an image of a single grey."""
     spectrum: Complex[np.ndarray, "row frequency"]
-    binning: int
-    grey: float
+    """Fourier transform of the detail under a window that fades towards the edges, of norm 1."""
+    binning: int  #: pixels of the image per pixel of the thumbnail
+    grey: float  #: mean of the grey values
 
     @classmethod
     def of(cls, image: Shaped[np.ndarray, "row column"]) -> Thumbnail:

@@ -25,16 +25,10 @@ LARGEST_WEIGHT = 4.0  # relative to the brightest filter: more would amplify the
 
 @dataclass(frozen=True)
 class Binning:
-    """Mean of each cell of 2 x 2 px of a raw mosaic; an odd last row or column is left out.
+    """Mean of each cell of 2 x 2 px of a raw mosaic; an odd last row or column is left out."""
 
-    Parameters
-    ----------
-    means : grey values at the places (0, 0), (0, 1), (1, 0), (1, 1) of the cells
-    full_scale : grey value of a saturated pixel; a cell with such a pixel is saturated
-    """
-
-    means: tuple[float, ...]
-    full_scale: float
+    means: tuple[float, ...]  #: grey values at the places (0, 0), (0, 1), (1, 0), (1, 1) of the cells
+    full_scale: float  #: grey value of a saturated pixel; a cell with such a pixel is saturated
 
     def __call__(self, image: Shaped[np.ndarray, "row column"]) -> Shaped[np.ndarray, "half_row half_column"]:
         """Return the binned image, of the same type."""

@@ -19,22 +19,14 @@ Pixels = Annotated[int, Ge(0)]
 
 @dataclass(frozen=True)
 class Crop:
-    """A part of each frame, such as one end of a fibre bundle: cropped, then rotated, then flipped.
+    """A part of each frame, such as one end of a fibre bundle: cropped, then rotated, then flipped."""
 
-    Parameters
-    ----------
-    row, column : top-left pixel
-    height, width : px; 0 for all up to the edge of the frame
-    flip : "", "horizontal" (exchanges left and right), "vertical" or "both"
-    rotate : 0, 90, 180 or 270 degrees counter-clockwise
-    """
-
-    row: Pixels = 0
-    column: Pixels = 0
-    height: Pixels = 0
-    width: Pixels = 0
-    flip: str = ""
-    rotate: int = 0
+    row: Pixels = 0  #: of the top-left pixel
+    column: Pixels = 0  #: of the top-left pixel
+    height: Pixels = 0  #: px; 0 for all up to the edge of the frame
+    width: Pixels = 0  #: likewise
+    flip: str = ""  #: "", "horizontal" (exchanges left and right), "vertical" or "both"
+    rotate: int = 0  #: 0, 90, 180 or 270 degrees counter-clockwise
 
     def __post_init__(self) -> None:
         check_settings(self)

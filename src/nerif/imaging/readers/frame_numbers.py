@@ -72,22 +72,13 @@ def numbers_in_names(names: Sequence[str]) -> Numbers | None:
 
 @dataclass(frozen=True)
 class Count:
-    """The common count of the flow images of several views: (number - first) // step - offset is the instant.
+    """The common count of the flow images of several views: (number - first) // step - offset is the instant."""
 
-    Parameters
-    ----------
-    first : number of instant 0
-    step : of the numbers
-    offsets : in instants, by the name of the view
-    in_order : whether the numbers are the places
-    lines : to report
-    """
-
-    first: int = 0
-    step: int = 1
-    offsets: Mapping[str, int] = field(default_factory=dict)
-    in_order: bool = False
-    lines: tuple[str, ...] = ()
+    first: int = 0  #: number of instant 0
+    step: int = 1  #: of the numbers
+    offsets: Mapping[str, int] = field(default_factory=dict)  #: in instants, by the name of the view
+    in_order: bool = False  #: whether the numbers are the places
+    lines: tuple[str, ...] = ()  #: to report
 
     def instants(self, view: str, numbers: Numbers) -> Numbers:
         """Return the instants of the images of a view."""

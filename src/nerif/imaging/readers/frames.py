@@ -34,26 +34,15 @@ LEAST_STORED = 1e-3  # of the frames of a header; a copy that was interrupted be
 
 @dataclass(frozen=True)
 class FrameLayout:
-    """Common properties of most of the sampled frames of a sequence, as they are stored.
+    """Common properties of most of the sampled frames of a sequence, as they are stored."""
 
-    Parameters
-    ----------
-    shape : height and width, px
-    dtype : of the grey values
-    example : name of a frame with these properties
-    peak : largest value
-    used : bits set in any value, 0 for floats
-    means : grey values at the places (0, 0), (0, 1), (1, 0), (1, 1) of cells of 2 x 2 px
-    pattern : of a raw mosaic recognised in most of them, such as "RGGB or BGGR"; "" if there is none
-    """
-
-    shape: tuple[int, int]
-    dtype: np.dtype
-    example: str
-    peak: float
-    used: int
-    means: tuple[float, ...]
-    pattern: str
+    shape: tuple[int, int]  #: height and width, px
+    dtype: np.dtype  #: of the grey values
+    example: str  #: name of a frame with these properties
+    peak: float  #: largest value
+    used: int  #: bits set in any value, 0 for floats
+    means: tuple[float, ...]  #: grey values at the places (0, 0), (0, 1), (1, 0), (1, 1) of cells of 2 x 2 px
+    pattern: str  #: of a raw mosaic recognised in most of them, such as "RGGB or BGGR"; "" if there is none
 
 
 class Frames(ABC):

@@ -66,25 +66,18 @@ BEFORE = "views.before.toml"
 
 @dataclass(frozen=True)
 class View:
-    """The images of one view.
-
-    Parameters
-    ----------
-    folder : base of relative sources
-    sources : arguments of open_frames, by the names of SOURCES
-    crop : the view's part of each frame
-    mosaic : Bayer pattern of its raw images, such as RGGB, or "none"; "" where it is in the metadata or is recognised
-    frame_offset : instant i of the measurement is flow image i + frame_offset of this view; None if it is not stated
-    count : that pairs the flow images of all views (`paired`); None: of this view alone
-    """
+    """The images of one view."""
 
     name: str
-    folder: Path
-    sources: dict[str, str]
-    crop: Crop | None = None
+    folder: Path  #: base of relative sources
+    sources: dict[str, str]  #: arguments of open_frames, by the names of SOURCES
+    crop: Crop | None = None  #: the view's part of each frame
     mosaic: str = ""
+    """Bayer pattern of its raw images, such as RGGB, or "none"; "" where it is in the metadata or is recognised."""
     frame_offset: int | None = None
+    """Instant i of the measurement is flow image i + frame_offset of this view; None if it is not stated."""
     count: Count | None = field(default=None, repr=False)
+    """That pairs the flow images of all views (`paired`); None: of this view alone."""
     _opened: dict[str, Frames] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:

@@ -75,20 +75,12 @@ Watch = Callable[["Posterior"], bool | None]
 
 @dataclass(frozen=True)
 class Posterior:
-    """The posterior of a field given its data.
+    """The posterior of a field given its data."""
 
-    Parameters
-    ----------
-    detail : that was solved
-    problem : in white noise
-    iterate : towards the mean
-    count : of iterations
-    """
-
-    detail: Detail
-    problem: WhiteProblem
-    iterate: Iterate
-    count: int
+    detail: Detail  #: that was solved
+    problem: WhiteProblem  #: in white noise
+    iterate: Iterate  #: towards the mean
+    count: int  #: of iterations
 
     @property
     def coefficients(self) -> Float[Tensor, "z y x"]:
@@ -314,22 +306,15 @@ class Detail:
 
 @dataclass(frozen=True)
 class DetailChoice:
-    """Which mean and prior predict a withheld view best.
+    """Which mean and prior predict a withheld view best."""
 
-    Parameters
-    ----------
-    blurred : whether the mean is the blurred reconstruction
-    passes : 1 or 2; None: two, if the objective is lower then
-    before, after : rms residual of the withheld view over sigma, without and with detail, over the bands of its pixels
-        by which nothing was chosen; NaN without such a view
-    seconds : that the detail is expected to take
-    """
-
-    blurred: bool = False
-    passes: int | None = None
+    blurred: bool = False  #: whether the mean is the blurred reconstruction
+    passes: int | None = None  #: 1 or 2; None: two, if the objective is lower then
     before: float = math.nan
-    after: float = math.nan
-    seconds: float = 0.0
+    """Rms residual of the withheld view over sigma without detail, over the bands of its pixels by which nothing was
+    chosen; NaN without such a view."""
+    after: float = math.nan  #: the same with detail
+    seconds: float = 0.0  #: that the detail is expected to take
 
     @property
     def pays(self) -> bool:

@@ -118,38 +118,24 @@ class PixelSampling:
 
 @dataclass(frozen=True)
 class RayBatch:
-    """Rays of one technique in a step.
+    """Rays of one technique in a step."""
 
-    Parameters
-    ----------
-    part : pixels, measured values and forward model
-    rays : of the pixels; with a lens several consecutive ones each
-    s, interval : (n, m) path lengths of the samples and of their intervals, mm
-    numbers : measured values of this process. If it is 0, a ray of another process stands in with weight 0, so that all
-        processes average the same terms and the gradients of the same weights
-    """
-
-    part: TechniqueData
-    rays: Rays
-    s: Tensor
-    interval: Tensor
+    part: TechniqueData  #: pixels, measured values and forward model
+    rays: Rays  #: of the pixels; with a lens several consecutive ones each
+    s: Tensor  #: (n, m) path lengths of the samples, mm
+    interval: Tensor  #: (n, m) path lengths of their intervals, mm
     numbers: int
+    """Measured values of this process. If it is 0, a ray of another process stands in with weight 0, so that all
+    processes average the same terms and the gradients of the same weights."""
 
 
 @dataclass(frozen=True)
 class Batch:
-    """The rays of a step.
+    """The rays of a step."""
 
-    Parameters
-    ----------
-    pieces : one per technique, this process's share
-    numbers : measured values of all processes
-    low : whether the network is evaluated in low precision
-    """
-
-    pieces: list[RayBatch]
-    numbers: int
-    low: bool = False
+    pieces: list[RayBatch]  #: one per technique, this process's share
+    numbers: int  #: measured values of all processes
+    low: bool = False  #: whether the network is evaluated in low precision
 
     @property
     def own_numbers(self) -> int:

@@ -48,18 +48,12 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class RigPosterior:
-    """A refined rig and the uncertainty of its parameters.
-
-    Parameters
-    ----------
-    table : for each view its parameters with their posterior standard deviations, and its residuals
-    rig : the refined rig, of the views with displacements
-    covariance : of all refined parameters in units of their sigmas, view by view
-    """
+    """A refined rig and the uncertainty of its parameters."""
 
     table: list[RefinedView]
-    rig: Refinement
-    covariance: Float[Tensor, "m m"]
+    """For each view its parameters with their posterior standard deviations, and its residuals."""
+    rig: Refinement  #: the refined rig, of the views with displacements
+    covariance: Float[Tensor, "m m"]  #: of all refined parameters in units of their sigmas, view by view
 
     @classmethod
     def of(

@@ -88,9 +88,10 @@ def reconstruct_sequence(
             say(f"{store.forget_failures()} failed frames are tried again")
         if pending := int((store.status == MISSING).sum()):
             say(f"{out}: {pending} of {len(sequence)} frames to reconstruct, in chunks of {settings.chunk}")
-            with if_interrupted(lambda: _kept(store, say)), open_cluster(
-                cluster, workers, plan.out.parent, dashboard
-            ) as (client, share):
+            with (
+                if_interrupted(lambda: _kept(store, say)),
+                open_cluster(cluster, workers, plan.out.parent, dashboard) as (client, share),
+            ):
                 if dashboard and client.dashboard_link:
                     say(f"dashboard: {client.dashboard_link}")
                 say("waiting for workers")

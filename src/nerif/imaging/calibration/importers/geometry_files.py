@@ -48,7 +48,12 @@ def read_geometry(path: Path, say: Callable[[str], None]) -> list[CalibratedCame
     sizes = np.asarray(entries.get("image_size", [size] * len(rows)))
     return [
         CalibratedCamera.from_values(
-            f"{path}: {c.name}", c.name, c.intrinsics, c.rotation, c.translation, image_size=sizes[i],
+            f"{path}: {c.name}",
+            c.name,
+            c.intrinsics,
+            c.rotation,
+            c.translation,
+            image_size=sizes[i],
             projection=c.projection.name,
         )
         for i, (c, _) in enumerate(results)
