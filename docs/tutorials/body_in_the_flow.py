@@ -89,7 +89,9 @@ from nerif.analysis.wall_values import surface_map
 from nerif.physics.quantities import GasSettings
 from nerif.report.surface_figure import draw_surface
 
-surface = surface_map(result.field, result.bodies, box, result.n_ambient, edge=0.8, gas=GasSettings())
+surface = surface_map(
+    result.field, result.bodies, box, result.n_ambient, edge=0.8, gas=GasSettings()
+)
 figure = plt.figure(figsize=(7, 3.5), layout="constrained")
 draw_surface(figure, surface, "density")
 
