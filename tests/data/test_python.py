@@ -33,6 +33,7 @@ def test_each_is_one_line_of_text(measurement, result, ball, box):
     assert "masked everywhere" in repr(masked)
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_arrays_and_lists_become_tensors_and_other_things_are_refused_by_name(measurement, result, box, tmp_path):
     camera, array = measurement.cameras[0], np.asarray
     names = ("intrinsics", "rotation", "translation", "distortion")
@@ -66,6 +67,7 @@ def test_single_voxels_are_not_the_range_that_is_shown(box):
         assert "1600 to 1600 K (0.1 to 99.9 %" in text
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_views_by_name(measurement):
     first, *others = measurement.names
     assert measurement[first].names == (first,)
