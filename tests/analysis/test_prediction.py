@@ -10,16 +10,17 @@ import xarray as xr
 
 from bodies import cuboid
 from nerif.analysis import prediction
-from nerif.analysis.prediction import SampledViews, on_voxels, reproject
+from nerif.analysis.prediction import SampledViews, on_grid, on_voxels, reproject, splines_for_views
 from nerif.data.measurement import Measurement
 from nerif.data.reprojection import Accuracy, Reprojection
 from nerif.fields.network import Network, NeuralField
 from nerif.fields.network_kinds import network_in
 from nerif.fields.network_shape import NetworkShape
 from nerif.fields.phantoms import GaussianBalls
+from nerif.fields.sum import SumField
 from nerif.forward.deflection import MODELS, Deflection
 from nerif.forward.path_integral import PathIntegral
-from nerif.geometry import Box, Ring
+from nerif.geometry import Box, Grid, Ring
 
 BOX = Box((-12.0, -10.0, -8.0), (12.0, 10.0, 8.0))
 
@@ -43,13 +44,12 @@ def rms(values: torch.Tensor) -> float:
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_sampled_views_and_their_accuracy(empty, model, monkeypatch):
-    monkeypatch.setattr(prediction, "SPLINE_VOXELS", 10)  # a lattice of every second pixel
+def test_sampled_views_and_their_accuracy(empty, model):
     centre, width, depth = torch.tensor([[1.0, -0.5, 0.0]]), torch.tensor([3.0]), torch.tensor([-2e-4])
     ball = GaussianBalls(centre.double(), width.double(), depth.double())
     forward, crosses = PathIntegral(MODELS[model](empty.n_ambient), prediction.SAMPLES), empty.sees_box
     exact = reproject(ball, empty, model=model).predicted[crosses]
-    views = SampledViews(ball, (on_voxels(ball, BOX),), BOX, forward)
+    views = SampledViews(ball, (on_voxels(ball, BOX, voxels=10),), BOX, forward)  # a lattice of every second pixel
     sampled = torch.stack([views(camera) for camera in empty.cameras])
     error = rms(sampled[crosses] - exact)
     assert error < 0.03 * rms(exact)
@@ -63,8 +63,7 @@ def test_large_images_of_a_network_are_sampled(network, empty, monkeypatch):
     exact, crosses = reproject(network, empty), empty.sees_box
     assert [a.error for a in exact.accuracies] == [0]
     monkeypatch.setitem(prediction.EXACT_WORK, "cpu", 0.0)
-    monkeypatch.setattr(prediction, "SPLINE_VOXELS", 30)
-    sampled = reproject(network, empty)
+    sampled = reproject(network, empty, splines=splines_for_views(network, empty, voxels=30))
     size = rms(exact.predicted[crosses])
     assert 0 < sampled.accuracies[0].error < 0.05 * size
     assert rms((sampled.predicted - exact.predicted)[crosses]) < 0.05 * size
@@ -74,9 +73,8 @@ def test_large_images_of_a_network_are_sampled(network, empty, monkeypatch):
 def test_each_technique_has_its_own_error_and_the_network_is_sampled_once(network, empty, monkeypatch):
     fringes = {"fringes": torch.zeros(2, 40, 46), "fringes_sigma": torch.ones(2, 40, 46)}
     combined = replace(empty, sigma=torch.ones_like(empty.displacement), maps=fringes, wavelength_nm=532.0)
-    monkeypatch.setattr(prediction, "SPLINE_VOXELS", 10)
     calls = []
-    monkeypatch.setattr(prediction, "on_voxels", lambda *args: calls.append(args) or on_voxels(*args))
+    monkeypatch.setattr(prediction, "on_voxels", lambda *args: calls.append(args) or on_voxels(*args[:3], 10))
     monkeypatch.setitem(prediction.EXACT_WORK, "cpu", 0.0)
     sampled = reproject(network, combined)
     monkeypatch.setitem(prediction.EXACT_WORK, "cpu", torch.inf)
@@ -115,3 +113,15 @@ def test_the_file_records_how_it_was_predicted(network, empty, tmp_path):
     assert back.withheld == ("70deg",)
     assert torch.equal(back.predicted, views.predicted)
     assert torch.equal(back.measurement.displacement, empty.displacement)
+
+
+def test_a_volume_on_the_voxels_of_the_splines_has_the_values_of_the_network(network):
+    grid = Grid.of_resolution(BOX, 12)
+    splines = on_voxels(network, BOX, voxels=12)
+    same, other = on_grid(network, splines, grid), on_grid(network, splines, Grid.of_resolution(BOX, 13))
+    assert same is splines
+    assert other is network
+    values = network.sample(grid)
+    torch.testing.assert_close(same.sample(grid), values, rtol=0, atol=1e-5 * float(values.abs().max()))
+    both = on_grid(SumField(network, splines), splines, grid)
+    torch.testing.assert_close(both.sample(grid), 2 * values, rtol=0, atol=2e-5 * float(values.abs().max()))

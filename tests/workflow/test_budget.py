@@ -69,7 +69,7 @@ def test_too_short_a_limit_is_said_with_what_it_would_take(clock, limit, reserve
 
 
 def test_trials_and_the_prediction_of_the_withheld_view_take_time_too(clock):
-    limit = Budget(60.0, 1000.0, 10.0, 400, 0.1, projection=8.0)
+    limit = Budget(60.0, 1000.0, 10.0, 400, 0.1, validation=8.0)
     assert not limit.shortage(0, validated=True)
     assert "18 s, which leaves 13 s" in limit.shortage(2, validated=True)
 

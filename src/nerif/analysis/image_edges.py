@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from nerif.common.arrays import Points
+from nerif.common.blocks import blocks
 from nerif.common.conventions import FACES
 from nerif.data.measurement import Measurement
 from nerif.data.measurement_data import Observation
@@ -28,6 +29,7 @@ MIN_REPEATED = 0.3  # of the mean square of neighbours, in their product: less i
 MIN_BEYOND = 0.05  # of the points of the box that other views show, beyond an edge
 STRIP = 12  # strips across an image
 GROWTH = 0.2  # of the longest edge of the box, by which the flow may continue beyond it
+PIXELS = 256  # along an edge of an image, from which it is binned
 POINTS = 16  # along the longest edge of the box
 REMEDY = (
     "record images that contain the whole flow; if it also leaves the box, give --open-faces with the faces that it "
@@ -63,7 +65,11 @@ def cut_edges(measurement: Measurement, observation: Observation) -> list[CutEdg
         height, width = camera.image_size
         usable = measurement.usable[i, :height, :width]
         d = observation.values[i, :height, :width].where(usable[..., None], torch.nan)
-        crosses = camera.rays(camera.pixel_grid().reshape(-1, 2)).clip(box).crosses.reshape(height, width)
+        edge = max(1, max(height, width) // PIXELS)
+        d = blocks(d, edge, edge).nanmean(dim=(1, 3))
+        centres = blocks(camera.pixel_grid(), edge, edge).mean(dim=(1, 3))
+        crosses = camera.rays(centres.reshape(-1, 2), sensitivity=False).clip(box).crosses.reshape(d.shape[:2])
+        height, width = d.shape[:2]
         rows, columns = max(1, height // STRIP), max(1, width // STRIP)
         strips = {
             "left": (slice(None), slice(0, columns)), "right": (slice(None), slice(width - columns, None)),

@@ -36,16 +36,21 @@ VOXEL_STEP = {"linear": 0.1, "cubic": 0.25}  # voxels between samples
 SAMPLES = 80  # per ray; error 0.06 % of the rms displacement for a network fitted to the flame
 SAMPLES_PER_VOXEL = 2  # the same for the splines of its detail
 GRADIENT_COST = 3.0  # of value and gradient, in evaluations: a forward pass and a backward pass of twice its work
-EXACT_WORK = {"cpu": 1e11, "cuda": 1e13}  # multiplications: four seconds on two cores
+EXACT_WORK = {"cpu": 3e10, "cuda": 1e13}  # multiplications: a second on two cores
 WALLS = 5  # times as many beside bodies, where splines would smooth the jump across a thin plate
-SPLINE_VOXELS, SPLINE_MARGIN = 100, 3  # along the longest edge of the box, and beyond each face
+SPLINE_VOXELS, SPLINE_MARGIN = 100, 3  # along the longest edge of the box, at least, and beyond each face
+VALIDATION_VOXELS = 64  # of splines through the field of a short run
+MOST_VOXELS = 256  # along the longest edge of a volume whose values are those of the splines
 SYMMETRIC_VOXELS = 400  # along the longest edge of (r, h)
 RAYS_PER_VOXEL = 1.4  # along an edge, at least
 COMPARED_PIXELS = 1024
 MAX_THIN_RAYS = 1 << 21  # per call of the voxel operator
 
 Splines = (VoxelField, SymmetricVoxels)
-__all__ = ["TRACED", "SampledViews", "check_sees", "evaluations", "predict", "predict_view", "reproject"]
+__all__ = [
+    "TRACED", "VALIDATION_VOXELS", "SampledViews", "check_sees", "evaluations", "on_grid", "on_voxels", "predict",
+    "predict_view", "reproject", "spline_voxels", "splines_for_views",
+]  # fmt: skip
 
 TRACED = "traced"  #: name of the deflection model that traces rays through the field, to all orders
 
@@ -137,6 +142,7 @@ def predict(
 def reproject(
     field: Field, measurement: Measurement, withheld: Collection[str] = (), device: torch.device | str = "cpu",
     on_view: Callable[[int, int], None] = lambda done, total: None, model: str = AUTO,
+    splines: VoxelField | SymmetricVoxels | None = None,
 ) -> Reprojection:  # fmt: skip
     """Predict every view of a measurement from a field, for each of its techniques.
 
@@ -148,12 +154,12 @@ def reproject(
     withheld : names of the views that the reconstruction did not use
     on_view : called with the numbers of predicted views and of all views
     model : forward model of the reconstruction
+    splines : through the network, if there are some already (`splines_for_views`)
     """
     box, maps, accuracies, done = measurement.box, {}, {}, 0
     integrals: dict[tuple[ForwardModel, int], Tensor] = {}  # images and displacements share one
-    network, *splines = field.parts if isinstance(field, SumField) else (field,)
-    large = isinstance(network, NeuralField) and not _is_exact(network.network, _points(measurement.cameras), device)
-    voxels = on_voxels(network, box, device) if large else None
+    _, *added = _parts(field)
+    splines = splines or splines_for_views(field, measurement, device)
     total = sum(len(_views_of(kind, measurement.cameras)) for kind in measurement.techniques)
     for observation in measurement.observations:
         kind = observation.technique
@@ -161,7 +167,7 @@ def reproject(
         images = forward if isinstance(forward, Images) else None
         integral = forward if images is None else images.integral
         projector = PathIntegral(integral, _samples(field))
-        sampled = None if voxels is None else SampledViews(field, (voxels, *splines), box, projector, device)
+        sampled = None if splines is None else SampledViews(field, (splines, *added), box, projector, device)
         predicted = torch.full_like(observation.values, float("nan"))
         views = [(i, kind.seen_by(measurement.cameras[i])) for i in _views_of(kind, measurement.cameras)]
         for i, camera in views:
@@ -212,15 +218,50 @@ def _points(cameras: Sequence[Camera]) -> float:
     return sum(n * c.image_size[0] * c.image_size[1] for n, c in zip(samples, cameras, strict=True))
 
 
-def evaluations(network: Network, cameras: Sequence[Camera], box: Box, device: torch.device | str = "cpu") -> float:
-    """Return how many evaluations of a network `reproject` takes; value and gradient count as GRADIENT_COST of them."""
-    points = _points(cameras)
+def evaluations(
+    network: Network, cameras: Sequence[Camera], box: Box, voxels: int, device: torch.device | str = "cpu"
+) -> float:
+    """Return how many evaluations of a network its volume (`voxels` along the longest edge) and its views take.
+
+    Value and gradient count as GRADIENT_COST of them.
+    """
+    volume, points = math.prod(Grid.of_resolution(box, voxels).shape), _points(cameras)
     if _is_exact(network, points, device):
-        return GRADIENT_COST * points
-    return float(math.prod(_extended(Grid.of_resolution(box, SPLINE_VOXELS), (0, 1, 2)).shape))
+        return volume + GRADIENT_COST * points
+    splines = math.prod(_extended(Grid.of_resolution(box, spline_voxels(voxels)), (0, 1, 2)).shape)
+    return float(splines if voxels == spline_voxels(voxels) else volume + splines)
 
 
-def on_voxels(field: Field, box: Box, device: torch.device | str = "cpu") -> VoxelField | SymmetricVoxels:
+def spline_voxels(voxels: int) -> int:
+    """Voxels of the splines beside a volume of `voxels` along the longest edge: the same if they are enough."""
+    return voxels if SPLINE_VOXELS <= voxels <= MOST_VOXELS else SPLINE_VOXELS
+
+
+def _parts(field: Field) -> tuple[Field, ...]:
+    return field.parts if isinstance(field, SumField) else (field,)
+
+
+def splines_for_views(
+    field: Field, measurement: Measurement, device: torch.device | str = "cpu", voxels: int = SPLINE_VOXELS
+) -> VoxelField | SymmetricVoxels | None:
+    """Return splines through the network of a field for its views; None without a network, or for few pixels."""
+    network = _parts(field)[0]
+    if not isinstance(network, NeuralField) or _is_exact(network.network, _points(measurement.cameras), device):
+        return None
+    return on_voxels(network, measurement.box, device, voxels)
+
+
+def on_grid(field: Field, splines: VoxelField | SymmetricVoxels | None, grid: Grid) -> Field:
+    """Return a field with the same values on a grid: with splines instead of its network, if these go through them."""
+    if not isinstance(splines, VoxelField) or splines.grid != _extended(grid, (0, 1, 2)):
+        return field
+    _, *added = _parts(field)
+    return SumField(splines, *added) if added else splines
+
+
+def on_voxels(
+    field: Field, box: Box, device: torch.device | str = "cpu", voxels: int = SPLINE_VOXELS
+) -> VoxelField | SymmetricVoxels:
     """Return cubic splines through a field on voxels that extend beyond the box, to be accurate at its faces."""
     symmetry = symmetry_of_field(field)
     if symmetry is not None:
@@ -229,7 +270,7 @@ def on_voxels(field: Field, box: Box, device: torch.device | str = "cpu") -> Vox
         whole = Box((left, *reduced.lower[1:]), reduced.upper)
         shape = (math.ceil(whole.edges[2] / size), 2, math.ceil(whole.edges[0] / size))
         return SymmetricVoxels.through(field, symmetry, _extended(Grid(whole, shape), (0, 2)), device)
-    grid = _extended(Grid.of_resolution(box, SPLINE_VOXELS), (0, 1, 2))
+    grid = _extended(Grid.of_resolution(box, voxels), (0, 1, 2))
     return VoxelField.through(field.sample(grid, device), grid)
 
 
@@ -275,7 +316,10 @@ class SampledViews:
     @property
     def resolution(self) -> int:
         """Voxels along the longest edge of the box."""
-        return SPLINE_VOXELS if isinstance(self.splines[0], VoxelField) else SYMMETRIC_VOXELS
+        splines = self.splines[0]
+        if not isinstance(splines, VoxelField):
+            return SYMMETRIC_VOXELS
+        return max(splines.grid.shape) - 2 * SPLINE_MARGIN
 
     def _bending(self, rays: Rays) -> Float[Tensor, "n c"]:
         """The difference between bent and straight rays."""

@@ -94,9 +94,12 @@ class Observation:
     def valid(self, view: int) -> Bool[Tensor, "row column"]:
         """Return the pixels of a view whose value and sigma are finite and within the limits of the technique."""
         least, most = self.technique.limits
-        mask = (self.values[view].abs() <= most).all(dim=-1)  # NaN compares false
+        mask = torch.ones(self.values.shape[1:3], dtype=torch.bool)
+        for values in self.values[view].unbind(-1):
+            mask &= values.abs() <= most  # NaN compares false
         if self.sigma is not None:
-            mask &= ((self.sigma[view] >= least) & (self.sigma[view] <= most)).all(dim=-1)
+            for sigma in self.sigma[view].unbind(-1):
+                mask &= (sigma >= least) & (sigma <= most)
         return mask
 
 
@@ -305,7 +308,7 @@ class MeasurementData:
         """The maps by technique, those without any usable pixel excluded."""
         maps = self.all_maps
         every = [Observation.of(kind, maps) for kind in TECHNIQUES.values() if kind.measured in maps]
-        usable = [o for o in every if len(every) == 1 or bool(self.usable_for(o).any())]
+        usable = [o for o in every if len(every) == 1 or bool(self._usable_for(o).any())]
         return tuple(usable or every)
 
     @property
@@ -351,9 +354,9 @@ class MeasurementData:
             maps |= {name: self.maps[name] for name in o.technique.beside if name in self.maps}
         return replace(self, **arguments_of(maps))
 
-    @property
+    @cached_property
     def usable(self) -> Bool[Tensor, "view row column"]:
-        """Valid pixels inside their image with data of any technique."""
+        """Valid pixels inside their image with data of any technique; not to be changed."""
         mask = self._unmasked
         for i in range(len(mask)):
             mask[i] &= self._with_data(i)
@@ -361,6 +364,11 @@ class MeasurementData:
 
     def usable_for(self, observation: Observation) -> Bool[Tensor, "view row column"]:
         """Return the valid pixels inside their image with data of one technique."""
+        if len(self.observations) == 1 and self.observations[0] is observation:
+            return self.usable.clone()
+        return self._usable_for(observation)
+
+    def _usable_for(self, observation: Observation) -> Bool[Tensor, "view row column"]:
         mask = self._unmasked
         for i in range(len(mask)):
             mask[i] &= observation.valid(i)

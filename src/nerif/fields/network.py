@@ -10,7 +10,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -67,7 +67,14 @@ def encode_pullback(
     return cotangent[:, :3] + torch.stack([(swirl * k).sum(dim=1) for k in waves.to(encoded).T], dim=1)
 
 
-Activation = Callable[[Tensor], tuple[Tensor, Tensor]]
+class Activation(NamedTuple):
+    """An activation, called for its value and derivative."""
+
+    value: Callable[[Tensor], Tensor]
+    both: Callable[[Tensor], tuple[Tensor, Tensor]]
+
+    def __call__(self, a: Tensor) -> tuple[Tensor, Tensor]:
+        return self.both(a)
 
 
 def _silu(a: Tensor) -> tuple[Tensor, Tensor]:
@@ -76,20 +83,23 @@ def _silu(a: Tensor) -> tuple[Tensor, Tensor]:
     return h, s + h * (1 - s)
 
 
+def _softplus(a: Tensor) -> Tensor:
+    return torch.nn.functional.softplus(a, beta=10.0)
+
+
 def _tanh(a: Tensor) -> tuple[Tensor, Tensor]:
     h = torch.tanh(a)
     return h, 1 - h * h
 
 
 ACTIVATIONS: dict[str, Activation] = {
-    "silu": _silu,
+    "silu": Activation(torch.nn.functional.silu, _silu),
     # sharpness 10: close to ReLU, but with a second derivative
-    "softplus": lambda a: (torch.nn.functional.softplus(a, beta=10.0), torch.sigmoid(10.0 * a)),
-    "tanh": _tanh,
-    "relu": lambda a: (torch.relu(a), (a > 0).to(a)),
-    "sine": lambda a: (torch.sin(a), torch.cos(a)),
+    "softplus": Activation(_softplus, lambda a: (_softplus(a), torch.sigmoid(10.0 * a))),
+    "tanh": Activation(torch.tanh, _tanh),
+    "relu": Activation(torch.relu, lambda a: (torch.relu(a), (a > 0).to(a))),
+    "sine": Activation(torch.sin, lambda a: (torch.sin(a), torch.cos(a))),
 }
-"""Each returns the activation and its derivative."""
 
 UNBOUNDED = (-math.inf, math.inf)
 SHARPNESS = 10.0  # of the bounds: the output bends within 0.3 units of one
@@ -144,7 +154,7 @@ class Network(nn.Module):
 
     def forward(self, p: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
         """Return the scaled index excess."""
-        h, _ = self._trunk(p, [])
+        h, _ = self._trunk(p)
         return self.bounded(self._value(p, h)[0])[0]
 
     def value_and_gradient(
@@ -199,13 +209,17 @@ class Network(nn.Module):
         """Return the derivative by x, y, z from that by the input of the first layer."""
         return encode_pullback(encoded, cotangent, self.waves)
 
-    def _trunk(self, p: Tensor, slopes: list[Tensor]) -> tuple[Tensor, Tensor]:
+    def _trunk(self, p: Tensor, slopes: list[Tensor] | None = None) -> tuple[Tensor, Tensor]:
+        """Output of the last layer, and the encoding; the derivatives of the activations are added to `slopes`."""
         activate = ACTIVATIONS[self.shape.activation]
         encoded = self.encode(p)
         h = encoded
         for i, layer in enumerate(self.layers, start=1):
-            h, slope = activate(layer(h))
-            slopes.append(slope)
+            if slopes is None:
+                h = activate.value(layer(h))
+            else:
+                h, slope = activate(layer(h))
+                slopes.append(slope)
             if i == self.shape.skip:
                 h = torch.cat([h, encoded], dim=1)
         return h, encoded

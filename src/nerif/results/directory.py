@@ -293,13 +293,14 @@ class ResultDirectory:
         """The directory of the run without a view."""
         return ResultDirectory(self.path / CROSS_VALIDATION, self.files.say)
 
-    def read(self, views: bool = True) -> Result:
+    def read(self, views: bool = True, reprojection: Reprojection | None = None) -> Result:
         """Read a result, complete or not; missing and damaged files are listed in it.
 
         Parameters
         ----------
         views : False to read only what a verdict needs, which is faster: settings, metrics, and the volumes if they
             have standard deviations
+        reprojection : content of its file, if it is in memory
         """
         if not any((self.path / name).exists() for name in (*FILES, LIVE) if name != REPORT):
             check_kind(self.path, RESULT)
@@ -337,8 +338,9 @@ class ResultDirectory:
             parts["volumes"] = attempt(VOLUME, self.volumes, parts["volumes"], consequence)
         if views:
             consequence = "no views to show; nerif evaluate --measurement FILE adds them"
-            parts["reprojection"] = reprojection = attempt(REPROJECTION, self.reprojection, None, consequence)
-            parts["measurement"] = self._measurement(run) if reprojection is None else reprojection.measurement
+            read = self.reprojection if reprojection is None else lambda: reprojection
+            parts["reprojection"] = predicted = attempt(REPROJECTION, read, None, consequence)
+            parts["measurement"] = self._measurement(run) if predicted is None else predicted.measurement
             if self.has(name := SURFACE[0]):
                 parts["surface"] = attempt(name, lambda: SurfaceMap.read(self / name), None, "no surface to show")
             parts["truth"] = self._truth(metrics, parts["volumes"], gaps)

@@ -10,8 +10,9 @@ from typing import TypeVar
 
 import torch
 
-from nerif.analysis.prediction import evaluations
+from nerif.analysis.prediction import VALIDATION_VOXELS, evaluations
 from nerif.data.measurement import Measurement
+from nerif.fields.network import Network
 from nerif.fields.network_kinds import network_in
 from nerif.geometry import Grid
 from nerif.reconstruction.device import resolve_device
@@ -45,7 +46,7 @@ class Budget:
     steps: int = 0  #: of the main fit, that are enough; 0 if unknown
     pace: float = 0.0  #: s per step; 0 if unknown
     words: tuple[str, str] = TRAINING  #: name of these steps, and what the pace follows from
-    projection: float = 0.0  #: s, to project a network into the views
+    validation: float = 0.0  #: s, to predict views in the cross-validation
 
     @classmethod
     def of(cls, reconstructor: Reconstructor, measurement: Measurement, voxels: int, start: float | None) -> Budget:
@@ -62,17 +63,18 @@ class Budget:
             return cls(0.0, start, 0.0)
         pixels = sum(c.image_size[0] * c.image_size[1] for c in measurement.cameras)
         reserve = REPORT + PER_PIXEL * pixels
-        grid = Grid.of_resolution(measurement.box, voxels)
         if isinstance(reconstructor, VoxelReconstructor) and resolve_device(reconstructor.device).type == "cpu":
             finest = Grid.of_resolution(measurement.box, reconstructor.voxels)
             pace = reconstructor.iteration_seconds(measurement, finest, torch.get_num_threads())
             return cls(limit, start, reserve, reconstructor.iterations, pace, ITERATIONS)
         if not isinstance(reconstructor, TrainingSettings):
             return cls(limit, start, reserve)
-        each, projection = _evaluation(reconstructor, measurement)
-        reserve += each * math.prod(grid.shape) + projection
+        network, device = _network(reconstructor, measurement), resolve_device(reconstructor.device)
+        each = _evaluation_seconds(network, device)
+        reserve += each * evaluations(network, measurement.cameras, measurement.box, voxels, device)
+        validation = each * math.prod(Grid.of_resolution(measurement.box, VALIDATION_VOXELS).shape)
         steps = min(reconstructor.first_cycle, reconstructor.max_steps or reconstructor.first_cycle)
-        return cls(limit, start, reserve, steps, STEP * each * reconstructor.points_per_batch, TRAINING, projection)
+        return cls(limit, start, reserve, steps, STEP * each * reconstructor.points_per_batch, TRAINING, validation)
 
     def with_reserve(self, seconds: float) -> Budget:
         """Return the budget with more time in reserve."""
@@ -108,7 +110,7 @@ class Budget:
         """
         if not self.limit:
             return ""
-        budget, fits = self.with_reserve(self.projection * validated), 1 + trials + SHORT_RUN * validated
+        budget, fits = self.with_reserve(self.validation * validated), 1 + trials + SHORT_RUN * validated
         seconds, rest, required = budget._for_fits / fits, self.limit - budget.left, self.steps * self.pace
         if budget.left >= LITTLE * self.limit and seconds >= FEW * required:
             return ""
@@ -121,12 +123,16 @@ class Budget:
         return f"{text}. Give --time-limit {math.ceil(enough / 10) * 10} or more"
 
 
-def _evaluation(settings: TrainingSettings, measurement: Measurement) -> tuple[float, float]:
-    """Times to evaluate a network at a point and to project it into the views, s, by a few points on this machine."""
-    device = resolve_device(settings.device)
+def _network(settings: TrainingSettings, measurement: Measurement) -> Network:
+    """Return a network as the one that is trained."""
     with torch.random.fork_rng(devices=[]):
         shape = settings.resolved_by(measurement).network
-        network = network_in(measurement.box, shape, bodies=measurement.bodies).to(device)
+        return network_in(measurement.box, shape, bodies=measurement.bodies)
+
+
+def _evaluation_seconds(network: Network, device: torch.device) -> float:
+    """Return the time to evaluate a network at a point, by a few points on this machine, s."""
+    network = network.to(device)
     points = torch.zeros(PROBE, 3, device=device)
     times = []
     for _ in range(4):  # the first is slower
@@ -134,5 +140,4 @@ def _evaluation(settings: TrainingSettings, measurement: Measurement) -> tuple[f
         with torch.no_grad():
             float(network(points).sum())  # waits for a GPU
         times.append(time.perf_counter() - start)
-    each = min(times) / PROBE
-    return each, each * evaluations(network, measurement.cameras, measurement.box, device)
+    return min(times) / PROBE

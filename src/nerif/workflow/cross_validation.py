@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from nerif.analysis.asymmetry import HALVES, withhold_half
 from nerif.analysis.evaluation import evaluate_views, rms_with_unit
-from nerif.analysis.prediction import reproject
+from nerif.analysis.prediction import VALIDATION_VOXELS, reproject, splines_for_views
 from nerif.common.conventions import InputError
 from nerif.common.files import read_json, write_json
 from nerif.data.measurement import Measurement
@@ -110,7 +110,9 @@ class CrossValidation:
         other = best_covered(self.data.cameras)[1]
         with self.monitor.counting(f"predicting {name}"):
             pair = with_rig(self.data.select([name, other]), result)
-            scores = evaluate_views(reproject(result.field, pair, [name], result.device, model=result.model))
+            splines = splines_for_views(result.field, pair, result.device, VALIDATION_VOXELS)
+            views = reproject(result.field, pair, [name], result.device, model=result.model, splines=splines)
+            scores = evaluate_views(views)
         views, fitted = ([v for v in scores if v["withheld"] is flag] for flag in (True, False))
         entries = {"views": views, "fitted_views": fitted, "seconds": time.monotonic() - start}
         with self._directory.writing(SCORES) as path:

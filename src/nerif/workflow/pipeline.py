@@ -82,9 +82,9 @@ def run_steps(run: ReconstructionRun) -> Reconstruction:
             so_far = step(run, so_far)
     finally:
         if so_far.result is not None and run.out.begun and run.out.has(FIELD):
-            judge(run)
+            judged = judge(run, so_far)
             if run.settings.report:
-                write_page(run)
+                write_page(run, judged)
     result, volume = so_far.the_result, run.out / VOLUME_VTI
     times = f"{result.seconds:.0f} s for the fit on {result.device}, {time.time() - run.budget.start:.0f} s"
     since = "since it was resumed" if run.resume else "in all"

@@ -17,8 +17,11 @@ from nerif.common.memory import free_memory
 from nerif.common.settings import with_present_names
 from nerif.data.measurement import Measurement
 from nerif.data.quantity_names import quantities_of
+from nerif.data.reprojection import Reprojection
 from nerif.data.volume import Volume
 from nerif.fields.field import Field
+from nerif.fields.symmetric import SymmetricVoxels
+from nerif.fields.voxel_field import VoxelField
 from nerif.geometry import Box, Grid
 from nerif.reconstruction.aperture import apply_aperture
 from nerif.reconstruction.detail.detail import DetailChoice, Posterior, check_sigma
@@ -232,6 +235,8 @@ class StepOutputs:
     posterior: Posterior | None = None  #: of the field, once detail has been added
     detail_entries: DetailEntries | None = None  #: of metrics.json
     quantities: tuple[Volume, ...] = ()  #: of the result, as volumes
+    splines: VoxelField | SymmetricVoxels | None = None  #: through the network, if its views follow from them
+    views: Reprojection | None = None  #: prediction of the views
     rig: RigPosterior | None = None  #: the refined rig with its uncertainty
 
     @classmethod

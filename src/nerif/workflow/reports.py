@@ -11,17 +11,19 @@ from nerif.reconstruction.progress import QUIET, Monitor
 from nerif.report import html
 from nerif.report.sequence_page import render_sequence
 from nerif.report.velocity_page import render_velocity
-from nerif.results.directory import REPORT, ResultDirectory
+from nerif.results.directory import REPORT, Result, ResultDirectory
 
 __all__ = ["write_report", "write_sequence_report"]
 
 
-def write_report(directory: str | os.PathLike[str], path: Path | None = None, monitor: Monitor = QUIET) -> Path:
-    """Write the report of a result directory, and return its path."""
+def write_report(
+    directory: str | os.PathLike[str], path: Path | None = None, monitor: Monitor = QUIET, result: Result | None = None
+) -> Path:
+    """Write the report of a result directory, and return its path; `result`: its content, if it has been read."""
     out = ResultDirectory(directory, monitor.say)
     path = path or out / REPORT
     with monitor.counting("writing the report"):
-        result = out.read()
+        result = result or out.read()
         page = html.render(result)
     with out.writing(REPORT) if path == out / REPORT else nullcontext():
         html.write(page, path)

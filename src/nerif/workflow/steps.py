@@ -17,7 +17,7 @@ import numpy as np
 
 from nerif.analysis.asymmetry import asymmetry, asymmetry_sentence
 from nerif.analysis.evaluation import evaluate_views, score_lines
-from nerif.analysis.prediction import reproject
+from nerif.analysis.prediction import on_grid, reproject, spline_voxels, splines_for_views
 from nerif.analysis.verdict import verdict
 from nerif.analysis.wall_values import surface_map
 from nerif.common.conventions import unit_shown
@@ -37,7 +37,7 @@ from nerif.reconstruction.shared_settings import SHORT_RUN, SharedSettings
 from nerif.reconstruction.uncertainty.deviations import VOXELS, Deviations
 from nerif.reconstruction.uncertainty.rig_posterior import RigPosterior
 from nerif.reconstruction.voxels.symmetry_axis import axis_of, better_direction
-from nerif.results.directory import CALIBRATION, versions
+from nerif.results.directory import CALIBRATION, Result, versions
 from nerif.results.metrics_file import DetailEntries, Metrics
 from nerif.workflow.bootstrap_runs import all_quantities, bootstrap, write_deviations
 from nerif.workflow.reconstruction_run import ReconstructionRun, StepOutputs
@@ -95,8 +95,9 @@ def _detail(run: ReconstructionRun, left: float) -> DetailChoice | None:
         return None
     with run.monitor.counting("choosing the detail") as bar:
         choice = choose(coarse, withheld, math.inf if on else MOST_BLURRED * left, bar)
-    errors = f"{choice.before:.2f} sigma without it, {choice.after:.2f} with it"
-    say(f"detail: residual of the withheld view, on pixels by which nothing was chosen, {errors}")
+    if not math.isnan(choice.before):
+        errors = f"{choice.before:.2f} sigma without it, {choice.after:.2f} with it"
+        say(f"detail: residual of the withheld view, on pixels by which nothing was chosen, {errors}")
     if choice.seconds > detail_share(run, choice) * left and not on:
         say(f"detail left out: it takes about {choice.seconds:.0f} s; give a longer --time-limit")
         return None
@@ -182,7 +183,9 @@ def write_field(run: ReconstructionRun, so_far: StepOutputs) -> StepOutputs:
     out.write_history(result.history)
     say(result.outcome.sentence)
     with run.monitor.counting("sampling the field"):
-        volumes = all_quantities(result, run.settings.gas, run.voxels)
+        splines = splines_for_views(result.field, so_far.measurement, result.device, spline_voxels(run.voxels))
+        field = on_grid(result.field, splines, Grid.of_resolution(result.box, run.voxels))
+        volumes = all_quantities(replace(result, field=field), run.settings.gas, run.voxels)
         out.write_volumes(volumes)
     for line in (*masked_lines(volumes), *run.settings.gas.remarks(volumes[0])):
         say(line)
@@ -196,7 +199,7 @@ def write_field(run: ReconstructionRun, so_far: StepOutputs) -> StepOutputs:
     )  # fmt: skip
     about = {**versions(), "outcome": result.outcome.reason, "seconds": round(result.seconds, 3)}
     out.write_settings(entries, about | ({"gains": run.inputs.gains} if run.inputs.gains else {}))
-    return replace(so_far, quantities=tuple(volumes))
+    return replace(so_far, quantities=tuple(volumes), splines=splines)
 
 
 def write_surface(run: ReconstructionRun, so_far: StepOutputs) -> StepOutputs:
@@ -246,14 +249,16 @@ def write_reprojection(run: ReconstructionRun, so_far: StepOutputs) -> StepOutpu
     """Write the prediction of every view, and its scores."""
     out, result, monitor = run.out, so_far.the_result, run.monitor
     with monitor.counting("re-projecting") as bar:
-        views = reproject(result.field, so_far.measurement, so_far.withheld, result.device, bar, result.model)
+        views = reproject(
+            result.field, so_far.measurement, so_far.withheld, result.device, bar, result.model, so_far.splines
+        )
     with monitor.counting("scoring the views"):
         scores = evaluate_views(views)
         out.add_metrics(views=scores, reprojection=[a.entries for a in views.accuracies])
         out.write_reprojection(views)
     for line in (*score_lines(scores), *(accuracy.sentence for accuracy in views.accuracies)):
         monitor.say(line)
-    return so_far
+    return replace(so_far, views=views)
 
 
 def write_axis(run: ReconstructionRun, so_far: StepOutputs) -> StepOutputs:
@@ -300,20 +305,21 @@ STEPS: tuple[Callable[[ReconstructionRun, StepOutputs], StepOutputs], ...] = (
 )  # fmt: skip
 
 
-def judge(run: ReconstructionRun) -> None:
-    """Write the verdict on the result, and the meridian plane of a symmetric flow."""
-    result = run.out.read()
+def judge(run: ReconstructionRun, so_far: StepOutputs) -> Result:
+    """Write the verdict on the result, and the meridian plane of a symmetric flow; return the result."""
+    result = run.out.read(reprojection=so_far.views)
     if (meridian := result.meridian) is not None:
         run.out.write_meridian(meridian)
     assessment = verdict(result)
     run.out.add_metrics(verdict=asdict(assessment))
     run.monitor.say(assessment.sentence)
+    return replace(result, metrics=run.out.metrics())
 
 
-def write_page(run: ReconstructionRun) -> None:
+def write_page(run: ReconstructionRun, result: Result) -> None:
     """Write report.html."""
     try:
-        write_report(run.out.path, monitor=run.monitor)
+        write_report(run.out.path, monitor=run.monitor, result=result)
     except Exception as error:  # of a figure, or of a full disk: the result is complete without it
         reason = f"{type(error).__name__}: {error}"
         run.monitor.say(f"report: not written ({reason}); write it by nerif report {word_of(run.out.path)}")

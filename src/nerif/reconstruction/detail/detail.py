@@ -68,6 +68,7 @@ BETTER = 0.99  # of the error of a prediction, at most
 TRIALS = 4  # blurred or not, in one pass or two
 BANDS = 8  # of the withheld pixels, in their order, that choose, and as many between them
 FINE_COST, BLURRED_COST = 28.0, 45.0  # seconds that detail takes over those of a trial; about a blurred field
+TRIAL_COST = 10.0  # seconds of a trial over those of a projection and back-projection, at least
 
 Watch = Callable[["Posterior"], bool | None]
 """Called after each iteration; returns True to stop."""
@@ -223,6 +224,15 @@ class Detail:
         return WhiteProblem(self.problem, prior, self.mean(blurred)).fits()
 
     @property
+    def projection_seconds(self) -> float:
+        """Time of a projection and a back-projection, s; of the second, as the first compiles."""
+        x = self.mean(blurred=False)
+        for _ in range(2):
+            start = time.perf_counter()
+            self.problem.adjoint(self.problem.forward(x))
+        return time.perf_counter() - start
+
+    @property
     def residual(self) -> float:
         """Rms residual of the field over sigma."""
         assert self.problem.noise is not None
@@ -353,8 +363,11 @@ def choose(
     """Return which mean and prior predict the withheld views of a field best, on a coarse grid.
 
     Every second band of their pixels chooses; the stated errors are those of the other bands. Once the detail is
-    expected to take more than `most` seconds, no further trial is made.
+    expected to take more than `most` seconds, no further trial is made, and none at all if that is known before.
     """
+    seconds = FINE_COST * TRIAL_COST * coarse.projection_seconds
+    if seconds > most:
+        return DetailChoice(seconds=seconds)
     target, start = coarse.others(withheld), time.perf_counter()
     band = torch.arange(len(target)) * 2 * BANDS // max(len(target), 1)
     choosing, scoring = (target[(band % 2 == half).nonzero()[:, 0]] for half in (0, 1))
