@@ -11,13 +11,13 @@ Source: the portmanteau test of residuals for whiteness, Box and Pierce, J. Am. 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from statistics import NormalDist
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-
-from nerif.common.blocks import blocks
 
 __all__ = ["Whiteness", "white_noise", "whiteness"]
 
@@ -59,7 +59,26 @@ def whiteness(residual: Map, predicted: Map | None, mask: Mask) -> Whiteness | N
     predicted : None where the patterns of the causes are not those of a shifted map, as in images
     mask : valid pixels
     """
-    coarse, fine = (_tested(residual, predicted, mask, edge) for edge in (COARSE, FINE))
+    valid = np.where(mask[..., None], residual, 0.0).astype(np.float64)
+    square = float((valid**2).sum()) / max(valid.shape[-1] * int(mask.sum()), 1)
+    sums, count = _block_sums(valid, FINE), _block_sums(mask[..., None].astype(np.float64), FINE)
+
+    @cache
+    def patterns() -> dict[str, list[Map]]:
+        causes = {} if predicted is None else _patterns(predicted)
+        return {
+            cause: [_block_sums(np.where(mask[..., None] & np.isfinite(p), p, 0.0), FINE) for p in maps]
+            for cause, maps in causes.items()
+        }
+
+    def coarser(sums: Map) -> Map:
+        return _block_sums(sums, COARSE // FINE)
+
+    fine = _tested(sums, count, square, FINE, patterns)
+    coarse = _tested(
+        coarser(sums), coarser(count), square, COARSE,
+        lambda: {cause: [*map(coarser, maps)] for cause, maps in patterns().items()},
+    )  # fmt: skip
     if coarse is None or fine is None:
         return None
     cause, share = _largest(fine.shares)
@@ -107,23 +126,20 @@ class _BlockTest:
     column: float
 
 
-def _tested(residual: Map, predicted: Map | None, mask: Mask, edge: int) -> _BlockTest | None:
-    valid = np.where(mask[..., None], residual, 0.0).astype(np.float64)
-    count = _block_sums(mask.astype(np.float64)[..., None], edge)[..., 0]
-    full = count >= edge * edge / 2
-    square = float((valid**2).sum()) / max(valid.shape[-1] * int(mask.sum()), 1)
+def _tested(
+    sums: Map, count: Map, square: float, edge: int, patterns: Callable[[], dict[str, list[Map]]]
+) -> _BlockTest | None:
+    """The test of the sums of a residual over blocks, each of a count of pixels; `patterns`: the same sums of them."""
+    full = count[..., 0] >= edge * edge / 2
     if int(full.sum()) < MIN_BLOCKS or not square > 0:
         return None
-    n = count[full][:, None]
-    z = _block_sums(valid, edge)[full] / np.sqrt(n * square)  # variance 1 for white noise
+    n = count[full]
+    z = sums[full] / np.sqrt(n * square)  # variance 1 for white noise
     energy = float((z**2).mean())
     correlated = energy > max(1 + SIGNIFICANT * math.sqrt(2 / z.size), MIN_GRAIN[edge] ** 2)
     shares: dict[str, float] = {}
-    for cause, patterns in (_patterns(predicted) if correlated and predicted is not None else {}).items():
-        means = [
-            _block_sums(np.where(mask[..., None] & np.isfinite(p), p, 0.0), edge)[full] / np.sqrt(n) for p in patterns
-        ]
-        shares[cause] = _explained(z, np.stack(means, axis=-1))
+    for cause, maps in (patterns() if correlated else {}).items():
+        shares[cause] = _explained(z, np.stack([of_blocks[full] / np.sqrt(n) for of_blocks in maps], axis=-1))
     if shares and (share := max(_explained_by_means(z, group) for group in np.argwhere(full).T)) > MIN_ROWS:
         shares["rows"] = share
     worst = int(np.argmax((z**2).sum(axis=1)))
@@ -132,7 +148,9 @@ def _tested(residual: Map, predicted: Map | None, mask: Mask, edge: int) -> _Blo
 
 
 def _block_sums(values: Map, edge: int) -> Float[np.ndarray, "rows columns c"]:
-    return blocks(values, edge, edge).sum(axis=(1, 3))
+    rows, columns = (np.arange(0, n - n % edge, edge) for n in values.shape[:2])
+    whole = values[: len(rows) * edge, : len(columns) * edge]
+    return np.add.reduceat(np.add.reduceat(whole, rows, axis=0), columns, axis=1)
 
 
 def _explained(z: Float[np.ndarray, "b c"], patterns: Float[np.ndarray, "b c pattern"]) -> float:

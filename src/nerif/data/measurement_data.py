@@ -382,8 +382,7 @@ class MeasurementData:
     @property
     def bad_pixels(self) -> int:
         """Number of pixels that are masked since they have no data: NaN, infinite or impossible numbers."""
-        mask = self._unmasked
-        return sum(int((mask[i] & ~self._with_data(i)).sum()) for i in range(len(mask)))
+        return int(self._unmasked.sum()) - int(self.usable.sum())
 
     @property
     def _unmasked(self) -> Bool[Tensor, "view row column"]:
