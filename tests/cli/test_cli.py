@@ -29,6 +29,8 @@ TINY = str.split("--image-size 18 22 --pixel-pitch 0.2 --views 4 --steps 40 --tr
 QUICK = str.split("""--network.depth 2 --network.width 24 --network.octaves 2 --network.directions 3 --max-steps 40
     --samples 12 16 --sample-jitter 2 --points-per-batch 600 --voxels 12 --device cpu --precision float32""")
 
+SHORT = str.split("--max-steps 4 --withhold none --no-report")
+
 
 @pytest.fixture(scope="module")
 def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -234,7 +236,7 @@ def test_ctrl_c_leaves_a_result_to_resume(work, tmp_path):
 def test_tensorboard_scalars(work, tmp_path, monkeypatch):
     pytest.importorskip("tensorboard")
     monkeypatch.setenv("TF_CPP_MIN_LOG_LEVEL", "3")
-    assert run("reconstruct", work / "m.nc", "-o", tmp_path / "r", "--tensorboard", "--no-report", *QUICK) == 0
+    assert run("reconstruct", work / "m.nc", "-o", tmp_path / "r", "--tensorboard", *QUICK, *SHORT) == 0
     assert list((tmp_path / "r/tensorboard").glob("events*"))
 
 
@@ -246,7 +248,7 @@ def test_nan_and_infinite_pixels_are_masked_and_counted(spoil, tmp_path, capsys)
         d["displacement"].values[0, 3, 4:9, 0] = np.nan
         d["displacement"].values[1, 5, 6, 1] = np.inf
 
-    assert run("reconstruct", spoil(edit), "-o", tmp_path / "r", "--no-report", *QUICK) == 0
+    assert run("reconstruct", spoil(edit), "-o", tmp_path / "r", *QUICK, *SHORT) == 0
     (line,) = (line for line in capsys.readouterr().out.splitlines() if "left out" in line)
     assert "6 pixels" in line
 

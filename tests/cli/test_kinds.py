@@ -113,7 +113,7 @@ def test_kinds_are_recognised(folder):
 def test_a_command_names_the_kind_that_it_got(folder, monkeypatch, refusal, command):
     monkeypatch.chdir(folder)
     before = sorted(folder.rglob("*"))
-    for name, kind in FILES.items():
+    for kind, name in {kind: name for name, kind in FILES.items()}.items():  # one of each
         if kind not in COMMANDS[command]:
             line = refusal(*(word.replace("{}", name) for word in command.split()))
             use = kind.use.format(path=name, parent=Path(name).parent)
