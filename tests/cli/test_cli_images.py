@@ -30,8 +30,9 @@ QUICK = ("--method", "dis")  # where the method does not matter
 def experiment(tmp_path_factory):
     """Images of four views, a calibration and a measurement, each made by its command."""
     folder = tmp_path_factory.mktemp("experiment")
-    words = str.split(f"--phantom gaussians --views {VIEWS} --arc 10 120 --image-size 96 112 --pixel-pitch 0.0425")
-    words += str.split("--background-distance 900 --references 3 --poses 6 --backgrounds 2 --truth-voxels 20")
+    words = str.split(f"--phantom gaussians --views {VIEWS} --arc 10 120 --image-size 80 92 --pixel-pitch 0.051")
+    words += str.split("--background-distance 900 --references 3 --poses 8 --backgrounds 2 --truth-voxels 20")
+    words += str.split("--columns 8 --rows 5")
     images = folder / "images"
     assert run("render", "-o", images, *words) == 0
     assert run(*calibrate(folder)) == 0
@@ -170,10 +171,10 @@ def test_calibration_of_other_views_or_sizes(copy, refusal):
     text, name = file.read_text(), read_cameras(file)[0].name
     file.write_text(text.replace(f'name = "{name}"', 'name = "other"'))
     assert f"no camera named '{name}'" in refusal(*displacement(copy, "--force"))
-    resized = text.replace("    96,\n    112,\n", "    192,\n    224,\n")
+    resized = text.replace("    80,\n    92,\n", "    160,\n    184,\n")
     assert resized != text
     file.write_text(resized)
-    assert "(192, 224)" in refusal(*displacement(copy, "--force"))
+    assert "(160, 184)" in refusal(*displacement(copy, "--force"))
 
 
 @pytest.mark.slow
@@ -186,7 +187,7 @@ def test_masks_by_threshold_and_drawn(experiment, tmp_path, capsys, refusal):
     assert bool(masked.flow_mask[strong & masked.usable].all())
     assert 0.02 < float(masked.flow_mask.float().mean()) < 0.9
     assert iio.imread(tmp_path / "masked.masks.png").std() > 10
-    drawing = np.full((96, 112), 255, np.uint8)
+    drawing = np.full((80, 92), 255, np.uint8)
     drawing[:10] = 0
     (tmp_path / "drawn").mkdir()
     iio.imwrite(tmp_path / f"drawn/{masked.names[1]}.png", drawing)
@@ -231,11 +232,11 @@ def test_calibrations_of_other_programs_are_imported(experiment, tmp_path, capsy
     words = ["calibrate", tmp_path, "-o", tmp_path / "out.toml", "--scale-mm", "1000"]
     assert run(*words) == 0
     assert "was not drawn" in capsys.readouterr().out
-    assert run(*words, *str.split("--background-distance 900 --image-size 96 112 --force")) == 0
+    assert run(*words, *str.split("--background-distance 900 --image-size 80 92 --force")) == 0
     camera, original = read_cameras(tmp_path / "out.toml")[0], originals[0]
     assert torch.allclose(camera.translation, original.translation)
     assert float(camera.background.normal @ original.background.normal) > 0.999
-    assert abs(camera.background.offset - original.background.offset) < 10
+    assert camera.background.offset == -900.0
 
 
 @pytest.mark.parametrize(
