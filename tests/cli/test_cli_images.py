@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import tomllib
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import imageio.v3 as iio
@@ -19,6 +20,7 @@ from nerif.data.cameras_file import read_cameras
 from nerif.data.measurement import Measurement
 from nerif.data.volume_file import read_volume
 from nerif.fields.phantoms import make_phantom
+from nerif.simulation.rendering import render
 from nerif.simulation.simulate import view_displacement
 
 BOX = str.split("--lower -25 -25 -25 --upper 25 25 25")
@@ -34,7 +36,9 @@ def experiment(tmp_path_factory):
     words += str.split("--background-distance 900 --references 3 --poses 8 --backgrounds 2 --truth-voxels 20")
     words += str.split("--columns 8 --rows 5")
     images = folder / "images"
-    assert run("render", "-o", images, *words) == 0
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("nerif.simulation.experiment.render", partial(render, steps=40))
+        assert run("render", "-o", images, *words) == 0
     assert run(*calibrate(folder)) == 0
     assert run(*displacement(folder)) == 0
     return folder
