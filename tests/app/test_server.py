@@ -134,7 +134,10 @@ def test_a_refused_address_names_the_option_and_the_token(server):
     assert "address of this server: localhost:9000. If that is a tunnel or proxy" in text
     assert "--allowed-host localhost:9000 (and --root-path" in text
     authorised = {"Host": f"127.0.0.1:{server.port}", "Cookie": server.cookie()}
-    assert "--allowed-host hub.example.org " in server.get("/design", {**authorised, "Origin": "https://hub.example.org"})[2]
+    assert (
+        "--allowed-host hub.example.org "
+        in server.get("/design", {**authorised, "Origin": "https://hub.example.org"})[2]
+    )
     assert "/?token=..." in server.get("/design")[2]
     for strange in ("<b>x</b>", "a b", "x;rm", "h:port"):
         assert server.get("/design", {"Host": strange})[::2] == (421, "This is not an address of this server.")
