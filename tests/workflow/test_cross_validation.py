@@ -46,7 +46,7 @@ def complete(measurement, tmp_path_factory) -> tuple[ResultDirectory, list[str]]
 def test_a_view_is_predicted_before_it_is_used(measurement, complete, tmp_path, method):
     out, lines = complete if method is VOXELS else (ResultDirectory(tmp_path / "r"), [])
     if method is NETWORK:
-        reconstruct_into(out.path, measurement, method, SILENT, monitor=Monitor(lines.append))
+        reconstruct_into(out.path, measurement, method, SILENT, voxels=10, monitor=Monitor(lines.append))
     result, name = out.read(), best_covered(measurement.cameras)[0]
     (score,) = result.metrics.cross_validation["views"]
     assert (score["name"], score["withheld"]) == (name, True)
@@ -119,7 +119,7 @@ def test_views_may_have_the_names_of_options():
 @pytest.mark.parametrize("in_short_run", [True, False])
 def test_an_interrupted_run_resumes_to_the_same_result(measurement, tmp_path, in_short_run):
     complete, out = ResultDirectory(tmp_path / "complete"), ResultDirectory(tmp_path / "interrupted")
-    reconstruct_into(complete.path, measurement, NETWORK, SILENT)
+    reconstruct_into(complete.path, measurement, NETWORK, SILENT, voxels=10)
     short = Monitor(training=lambda title: nullcontext(lambda step: "without" in title and step.step == 5))
     stop = {"monitor": short} if in_short_run else {"on_step": lambda step: step.step == 20}
     first = reconstruct_into(out.path, measurement, NETWORK, SILENT, **stop)
