@@ -71,7 +71,7 @@ def test_the_terms_of_the_paper_agree_on_a_fitted_field(measurement):
     )  # fmt: skip
     result = settings(measurement)
     assert set(result.history[-1]) >= {"consistency", "numerical", "head", "gauge", "loss"}
-    last = [record["loss"] for record in result.history[-4:]]  # each of a batch of 85 rays; of 43, the first loss is 0.7 to 1.6
+    last = [record["loss"] for record in result.history[-4:]]  # of batches of 85 rays; of 43, the first varies by 2
     assert sum(last) / len(last) < 0.25 * result.history[0]["loss"]
     field, step = result.field, 1e-2
     p = field.normalise(Grid.of_resolution(measurement.box, 12).points().reshape(-1, 3))
