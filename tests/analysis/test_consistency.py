@@ -122,7 +122,7 @@ def test_a_view_of_another_flow_or_of_noise_is_named(clean, other):
 )  # fmt: skip
 def test_no_false_alarm(phantom, seed, noise, few):
     measurement = square(phantom=phantom, views=3) if few else measure(phantom, seed, noise=noise)
-    check = check_consistency(measurement, voxels=COARSE if few else 20)
+    check = check_consistency(measurement, voxels=8 if few else 20)
     assert check.findings == ()
     assert all(v.verdict == "" for v in check.views)
     assert any("lighter" in r for r in check.remarks)
@@ -178,7 +178,7 @@ def test_a_shaken_camera_or_noise_cuts_nothing(small):
 
 def test_views_of_a_part_of_the_flow_accuse_nothing():
     m = square(phantom="flame", views=3, image_size=(20, 20), pixel_pitch=0.04, noise=0.02)
-    outcome = check_consistency(m, voxels=COARSE)
+    outcome = check_consistency(m, voxels=8)
     assert (outcome.findings, outcome.corrections) == ((), {})
     start = "the images show only 6% of the box, and the displacement does not fall to zero"
     assert outcome.remarks[0].startswith(start)
