@@ -49,8 +49,8 @@ def statements(node: ast.AST, name: str = "", inside: bool = False) -> Iterator[
             if inside and isinstance(child, ast.stmt):
                 yield name, ast.unparse(child).split("\n", 1)[0], body, i
             named = isinstance(child, ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef)
-            own = f"{name}.{child.name}".lstrip(".") if named and not inside else name
-            yield from statements(child, own, inside or (named and not isinstance(child, ast.ClassDef)))
+            inner = f"{name}.{child.name}".lstrip(".") if named and not inside else name
+            yield from statements(child, inner, inside or (named and not isinstance(child, ast.ClassDef)))
 
 
 def find(tree: Path) -> list[tuple[Path, str] | None]:
@@ -80,11 +80,11 @@ def change(path: Path, name: str, place: dict[str, str], mark: str = "") -> None
 
 def marks() -> list[int]:
     """Return the places executed since the last call by this process and those that it started; remove their marks."""
-    os.environ["PLACE_MARKS"] = own = f"{MARKS}/{os.getpid()}"
-    os.makedirs(own, exist_ok=True)
-    names = os.listdir(own)
+    os.environ["PLACE_MARKS"] = folder = f"{MARKS}/{os.getpid()}"
+    os.makedirs(folder, exist_ok=True)
+    names = os.listdir(folder)
     for name in names:
-        os.unlink(f"{own}/{name}")
+        os.unlink(f"{folder}/{name}")
     return [int(name) for name in names]
 
 
@@ -149,10 +149,12 @@ def record(tree: Path) -> dict[str, Any]:
 
 
 def outcome(i: int, tests: dict[str, Any], trees: queue.Queue[Path]) -> tuple[str, str]:
-    """Break a place; return by which test it was found, if any, and what to say otherwise."""
-    own = sorted((name for name, test in tests.items() if i in test["places"]), key=lambda name: tests[name]["seconds"])
-    ends = itertools.accumulate(tests[name]["seconds"] for name in own)
-    tried = [name for name, end in zip(own, ends, strict=True) if end < LIMIT or name == own[0]]
+    """Break a place; return by which test it was detected, if any, and what to say otherwise."""
+    names = sorted(
+        (name for name, test in tests.items() if i in test["places"]), key=lambda name: tests[name]["seconds"]
+    )
+    ends = itertools.accumulate(tests[name]["seconds"] for name in names)
+    tried = [name for name, end in zip(names, ends, strict=True) if end < LIMIT or name == names[0]]
     tree, by = trees.get(), ""
     at = find(tree)[i]
     if at and tried:
@@ -162,7 +164,7 @@ def outcome(i: int, tests: dict[str, Any], trees: queue.Queue[Path]) -> tuple[st
         by = run(tree, ["-x", *sorted({name.split("::")[0] for name in tried})], PLACE_TESTS=str(order))
         at[0].write_bytes(source)
     trees.put(tree)
-    missed = f"**missed** by {len(tried)} of {len(own)} tests that execute it" if at else "no longer there"
+    missed = f"**missed** by {len(tried)} of {len(names)} tests that execute it" if at else "no longer there"
     return by, missed
 
 
@@ -171,22 +173,24 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("record", type=Path, help="file of the record; read if it exists")
     parser.add_argument("--only", type=int, nargs="+", default=range(len(PLACES)), help="numbers of places")
-    given, free, count = parser.parse_args(), queue.Queue(), 0
+    options, free, count = parser.parse_args(), queue.Queue(), 0
     with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(JOBS) as pool:
         archive = subprocess.run(["git", "archive", "HEAD"], cwd=ROOT, capture_output=True, check=True).stdout
         for tree in (Path(folder, str(i)) for i in range(JOBS + 1)):
             tree.mkdir()
             subprocess.run(["tar", "-x", "-C", str(tree)], input=archive, check=True)
             free.put(tree)
-        if not given.record.exists():
-            given.record.write_text(json.dumps(record(free.get())))
-        tests = json.loads(given.record.read_text())
-        print("| place | in | statement | becomes | found by |\n|---|---|---|---|---|")
-        for i, (by, missed) in zip(given.only, pool.map(lambda i: outcome(i, tests, free), given.only), strict=True):
+        if not options.record.exists():
+            options.record.write_text(json.dumps(record(free.get())))
+        tests = json.loads(options.record.read_text())
+        print("| place | in | statement | becomes | detected by |\n|---|---|---|---|---|")
+        for i, (by, missed) in zip(
+            options.only, pool.map(lambda i: outcome(i, tests, free), options.only), strict=True
+        ):
             cells = (f"`{PLACES[i][name]}`" for name in ("function", "statement", "becomes"))
             print(f"| {i} {PLACES[i]['room']}", *cells, f"{by.split(' - ')[0] or missed} |", sep=" | ", flush=True)
             count += bool(by)
-    print(f"\n{count} of {len(given.only)} found")
+    print(f"\n{count} of {len(options.only)} detected")
 
 
 if __name__ == "__main__":
