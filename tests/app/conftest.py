@@ -43,7 +43,7 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
     shutil.rmtree(project / "run" / "cam3" / "flow")
     cameras = Ring(views=3, arc=(20.0, 100.0), image_size=(24, 30), pixel_pitch=0.2).cameras()
     write_cameras(project / "made.toml", [CalibratedCamera.from_camera(camera) for camera in cameras])
-    Simulation(phantom="gaussians", truth_voxels=6)(cameras)[0].write(project / "m.nc")
+    Simulation(phantom="gaussians", truth_voxels=6, steps=20)(cameras)[0].write(project / "m.nc")
     result(project / "results" / "a <b>", 20, 0.0)
     result(project / "results" / "other", 16, 0.1)
     watched(project)

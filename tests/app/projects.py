@@ -27,7 +27,7 @@ BOX = Box((-25.0, -24.0, -20.0), (25.0, 24.0, 20.0))
 AMBIENT = 1.00027
 TARGET = CalibrationTarget("chessboard", 8, 5, pitch=12.0)
 SIMULATE = ["--image-size", "20", "24", "--pixel-pitch", "0.18", "--views", "4", "--arc", "0", "135"]
-SIMULATE += ["--truth-voxels", "8"]
+SIMULATE += ["--truth-voxels", "8", "--steps", "20"]
 OUT = "results/live <b>"
 LOWER, UPPER = (-20.0, -15.0, -10.0), (20.0, 15.0, 10.0)
 REPORT = """<!doctype html><title>r</title><p id=outcome>nothing</p><script>

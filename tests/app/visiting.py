@@ -127,6 +127,7 @@ class Visitor:
 async def visiting(folder: Path) -> AsyncIterator[Visitor]:
     """Serve a project to a simulated user; its runs are started, and no page may raise an error."""
     errors: list[Exception] = []
+    of_pages: list[Exception] = []
     work = Workspace(ProjectFolder(folder))
     try:
         async with user_simulation(lambda: None) as user:
@@ -145,7 +146,7 @@ async def visiting(folder: Path) -> AsyncIterator[Visitor]:
                 Client.page_routes.clear()  # else the modules of the pages would be imported again
     finally:
         core.reset()  # the loop of this test is no one else's
-    assert errors == []
+    assert of_pages == []
 
 
 def _visible(element: ui.element) -> bool:

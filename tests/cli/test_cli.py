@@ -29,6 +29,8 @@ TINY = str.split("--image-size 18 22 --pixel-pitch 0.2 --views 4 --steps 40 --tr
 QUICK = str.split("""--network.depth 2 --network.width 24 --network.octaves 2 --network.directions 3 --max-steps 40
     --samples 12 16 --sample-jitter 2 --points-per-batch 600 --voxels 12 --device cpu --precision float32""")
 
+SHORT = str.split("--max-steps 4 --withhold none --no-report")
+
 
 @pytest.fixture(scope="module")
 def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -81,7 +83,9 @@ def test_result_directory_is_complete(work):
 def test_run_toml_repeats_the_run(work, tmp_path):
     settings = tomllib.loads((work / "r/run.toml").read_text())
     assert (settings["network"]["width"], settings["withhold"]) == (24, ["170deg"])
-    assert run("reconstruct", "--config", work / "r/run.toml", "-o", tmp_path / "again", work / "m.nc") == 0
+    assert (
+        run("reconstruct", "--config", work / "r/run.toml", "-o", tmp_path / "again", "--no-report", work / "m.nc") == 0
+    )
     points = torch.rand(20, 3)
     assert torch.equal(read_field(work / "r")[0](points), read_field(tmp_path / "again")[0](points))
 
@@ -202,9 +206,9 @@ def test_a_volume_as_phantom(work, tmp_path):
 
 def test_resume_continues_with_other_limits(work, result):
     before = read_field(result)[0](torch.zeros(1, 3))
-    assert run("reconstruct", "--resume", "-o", result, "--max-steps", "60", work / "m.nc") == 0
+    assert run("reconstruct", "--resume", "-o", result, "--max-steps", "50", work / "m.nc") == 0
     assert metrics_of(result)["outcome"] == "steps"
-    assert (result / "history.csv").read_text().splitlines()[-1].startswith("60.0,")
+    assert (result / "history.csv").read_text().splitlines()[-1].startswith("50.0,")
     assert not torch.equal(before, read_field(result)[0](torch.zeros(1, 3)))
 
 
@@ -234,7 +238,7 @@ def test_ctrl_c_leaves_a_result_to_resume(work, tmp_path):
 def test_tensorboard_scalars(work, tmp_path, monkeypatch):
     pytest.importorskip("tensorboard")
     monkeypatch.setenv("TF_CPP_MIN_LOG_LEVEL", "3")
-    assert run("reconstruct", work / "m.nc", "-o", tmp_path / "r", "--tensorboard", "--no-report", *QUICK) == 0
+    assert run("reconstruct", work / "m.nc", "-o", tmp_path / "r", "--tensorboard", *QUICK, *SHORT) == 0
     assert list((tmp_path / "r/tensorboard").glob("events*"))
 
 
@@ -246,7 +250,7 @@ def test_nan_and_infinite_pixels_are_masked_and_counted(spoil, tmp_path, capsys)
         d["displacement"].values[0, 3, 4:9, 0] = np.nan
         d["displacement"].values[1, 5, 6, 1] = np.inf
 
-    assert run("reconstruct", spoil(edit), "-o", tmp_path / "r", "--no-report", *QUICK) == 0
+    assert run("reconstruct", spoil(edit), "-o", tmp_path / "r", *QUICK, *SHORT) == 0
     (line,) = (line for line in capsys.readouterr().out.splitlines() if "left out" in line)
     assert "6 pixels" in line
 

@@ -167,7 +167,9 @@ def test_ctrl_c_in_the_second_trial_keeps_the_first_and_resumes(path, result, tm
         return interrupt if "trial 2" in title else progress_bar(title)
 
     monkeypatch.setattr(output, "progress_bar", interrupting)
-    assert run("reconstruct", path, "-o", out, *QUICK, "--uncertainty", "fast", "--no-report") == 0
+    assert (
+        run("reconstruct", path, "-o", out, *QUICK, "--uncertainty", "fast", "--withhold", "none", "--no-report") == 0
+    )
     assert "interrupted after 1 of 2" in capsys.readouterr().out
     assert (out / "volume.nc").is_file()
     monkeypatch.setattr(output, "progress_bar", progress_bar)

@@ -113,7 +113,7 @@ def test_kinds_are_recognised(folder):
 def test_a_command_names_the_kind_that_it_got(folder, monkeypatch, refusal, command):
     monkeypatch.chdir(folder)
     before = sorted(folder.rglob("*"))
-    for name, kind in FILES.items():
+    for kind, name in {kind: name for name, kind in FILES.items()}.items():  # one of each
         if kind not in COMMANDS[command]:
             line = refusal(*(word.replace("{}", name) for word in command.split()))
             use = kind.use.format(path=name, parent=Path(name).parent)
@@ -179,7 +179,7 @@ def test_vectors_of_other_programs_are_named_and_where_to_go(folder, tmp_path, m
     else:
         Path(name).write_text(content)
     got = f"got vectors of {program or 'another program'}; compute displacements from its images: nerif displacement "
-    for command in ("info {}", "reconstruct {} -o new", "displacement {} --calibration c.toml -o n.nc", "calibrate {}"):
+    for command in ("info {}", "calibrate {}"):
         assert got in refusal(*command.format(name).split())
     for other in ("name,fx,fy\na,1,1\n", "rx,ry,rz,tx,ty,tz\n1,2,3,4,5,6\n", "cores: 4\n", "a few words, x and y\n"):
         Path("other.txt").write_text(other)

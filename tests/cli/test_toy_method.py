@@ -86,7 +86,8 @@ def test_a_run_its_report_and_its_repetition(toy, measurement, tmp_path):
     measurement.write(tmp_path / "m.nc")
     first, again = tmp_path / "first", tmp_path / "again"
     voxels = ["--voxels", "8", *(["--iterations", "6"] if toy is Toy else [])]
-    assert run("reconstruct", tmp_path / "m.nc", "-o", first, "--method", "toy", "--gait", "brisk", *voxels) == 0
+    words = ["--method", "toy", "--gait", "brisk", *voxels]
+    assert run("reconstruct", tmp_path / "m.nc", "-o", first, *words) == 0
     assert (ResultDirectory(first).settings()["method"], ResultDirectory(first).settings()["gait"]) == ("toy", "brisk")
     assert toy.title in (first / "report.html").read_text()
     assert run("reconstruct", "--config", first / "run.toml", "-o", again, "--no-report") == 0
@@ -94,8 +95,6 @@ def test_a_run_its_report_and_its_repetition(toy, measurement, tmp_path):
     assert torch.equal(fields[0].coefficients, fields[1].coefficients)
     assert run("evaluate", again, "--measurement", tmp_path / "m.nc") == 0
     assert metrics_of(again)["views"]
-    assert run("report", again) == 0
-    assert toy.title in (again / "report.html").read_text()
 
 
 def test_the_app_offers_it(toy):

@@ -133,6 +133,7 @@ def test_progress_without_a_terminal_is_in_lines_after_a_while(monkeypatch, caps
         bar(3)
         while "tracing rays 3/9" not in lines and time.monotonic() < deadline:
             lines += capsys.readouterr().err
+            time.sleep(0.01)
     assert lines.count("\n") == 1
 
 

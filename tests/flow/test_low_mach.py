@@ -130,7 +130,7 @@ def test_the_velocity_of_a_hot_puff_follows_from_its_densities():
     theta = 0.6 * torch.exp(-((plane.points(torch.float32) - torch.tensor([0.0, 0.0, -8.0])) / 9.0).square().sum(-1))
     velocity = torch.zeros_like(box.spectrum(box.extended(theta).expand(3, -1, -1, -1)))
     thetas, velocities = [theta], [velocity]
-    for k in range(100):
+    for k in range(70):
         now = box.extended(theta)
         moved = equations._from_before(velocity, box.spline(box.spectrum(now))[None], step)[0]
         theta = box.inside(moved) + step * equations.rate(theta[None], plane)[0]
@@ -141,9 +141,9 @@ def test_the_velocity_of_a_hot_puff_follows_from_its_densities():
     film = torch.stack(thetas[3:])
     true = torch.stack([box.inside(box.values(v)) for v in velocities[3:]])
     strong = (film > 0.05 * film.max())[:, None].expand_as(true)
-    settings = VelocityFit(physics="low-mach", resolution=32, time_limit=0, max_iterations=30, samples=0)
-    flow = settings(film, plane, [0.01 * k for k in range(8)], box_of=AxisymmetricBox)
+    settings = VelocityFit(physics="low-mach", resolution=32, time_limit=0, max_iterations=15, samples=0)
+    flow = settings(film, plane, [0.01 * k for k in range(5)], box_of=AxisymmetricBox)
     assert float((flow.velocity - true)[strong].norm() / true[strong].norm()) < 0.15
     assert flow.pressure is not None
     with refused("physics"):
-        VelocityFit()(film, plane, [0.01 * k for k in range(8)], box_of=AxisymmetricBox)
+        VelocityFit()(film, plane, [0.01 * k for k in range(5)], box_of=AxisymmetricBox)

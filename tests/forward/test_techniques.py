@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import ast
 import math
+import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -65,7 +65,7 @@ def balls() -> Field:
 def measured(balls) -> dict[str, Measurement]:
     def of(kind: type[ForwardModel]) -> Measurement:
         field = Scaled(balls, 1e-3) if kind.quantity == "index_excess" else balls
-        return simulate(field, RING.cameras(), BOX, 1.00027, 0.02, 1, 60, 532.0, techniques=[kind])
+        return simulate(field, RING.cameras(), BOX, 1.00027, 0.02, 1, 30, 532.0, techniques=[kind])
 
     return {kind.name: of(kind) for kind in SIMULATED.values()}
 
@@ -80,8 +80,7 @@ def test_a_technique_is_one_file_and_nothing_else_depends_on_it():
     others = set(homes) - {Deflection.__module__, Images.__module__}  # the data own images, see TechniqueData
     for path in PACKAGE.rglob("*.py"):
         if path.relative_to(PACKAGE).parts[0] != "forward":
-            nodes = ast.walk(ast.parse(path.read_text()))
-            assert not others & {node.module for node in nodes if isinstance(node, ast.ImportFrom)}, path
+            assert not others & {*re.findall(r"^ *from (\S+) import", path.read_text(), re.MULTILINE)}, path
 
 
 @pytest.mark.slow
@@ -192,7 +191,7 @@ def test_every_method_finds_the_field(kind, measured, balls):
 def both(balls) -> Measurement:
     """Displacements and fringes of one index."""
     kinds = [Deflection, Interferometry]
-    return simulate(Scaled(balls, 1e-3), RING.cameras(), BOX, 1.00027, 0.3, 1, 60, 532.0, techniques=kinds)
+    return simulate(Scaled(balls, 1e-3), RING.cameras(), BOX, 1.00027, 0.3, 1, 30, 532.0, techniques=kinds)
 
 
 @pytest.mark.slow
@@ -211,7 +210,7 @@ HEADS = NetworkShape(width=32, depth=2, gradient_head=True)
 
 def test_loss_terms_of_a_technique_without_gradient(measured, both):
     """Of the terms of the paper only those of the value are left."""
-    history = replace(NETWORK, network=HEADS, weights=THREE, max_steps=60)(measured["emission"]).history
+    history = replace(NETWORK, network=HEADS, weights=THREE, max_steps=30)(measured["emission"]).history
     assert history[-1]["loss"] < 0.5 * history[0]["loss"]
     assert history[0]["loss"] == pytest.approx(history[0]["head"] + history[0]["numerical"])
     network, names = Network(HEADS), []

@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from scipy.ndimage import gaussian_filter, map_coordinates
+from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter
 
 from nerif.imaging.displacement.correlation import normalised_median_outliers, window_correlation
 from nerif.imaging.displacement.displacement import UNEVEN, displacement, measure
@@ -28,11 +28,15 @@ STILL = np.zeros((*SHAPE, 2))
 def pattern():
     """Printed dots as a function of position."""
     fine = gaussian_filter(Background("dots", 140.0, 110.0, dot=3.0, seed=4).raster(0.25), 2.0)
+    return interpolator(fine, lambda pixels: (pixels + 10) * 4 + 1.5)
 
-    def at(rows, columns):
-        return map_coordinates(fine, [(rows + 10) * 4 + 1.5, (columns + 10) * 4 + 1.5], order=3, mode="reflect")
 
-    return at
+def interpolator(fine, places):
+    """Cubic splines through a fine image, as a function of rows and columns in px."""
+    spline = spline_filter(fine, mode="reflect")
+    return lambda rows, columns: map_coordinates(
+        spline, [places(rows), places(columns)], order=3, mode="reflect", prefilter=False
+    )
 
 
 @pytest.fixture(scope="module")
@@ -83,8 +87,7 @@ def test_local_contrast_compensates_uneven_light(pattern, truth):
     assert median_error(d, truth) < 0.08
 
 
-@pytest.mark.parametrize("references", [1, 4])
-@pytest.mark.parametrize("method", ["deepflow", "dis", "ilk", "correlation"])
+@pytest.mark.parametrize(("method", "references"), [("deepflow", 4), ("dis", 1), ("ilk", 4), ("correlation", 1)])
 def test_sigma_is_about_the_error(pattern, truth, method, references):
     frames, flow = images(pattern, truth, references, noise=40.0)
     result = measure(frames, [flow], DisplacementSettings(method), FULL)
@@ -103,7 +106,7 @@ def test_repeats_follow_the_noise_of_the_camera(pattern):
 
 def test_averaging_flow_images_lowers_noise(pattern):
     references, _ = images(pattern, STILL, 4, noise=60.0)
-    flows = [images(pattern, STILL, 1, 60.0, seed=s)[1] for s in range(20, 26)]
+    flows, _ = images(pattern, STILL, 6, noise=60.0, seed=20)
     one, six = (measure(references, f, DisplacementSettings("dis")) for f in (flows[:1], flows))
     assert np.square(six.displacement[INNER]).mean() < 0.64 * np.square(one.displacement[INNER]).mean()
     assert np.median(six.sigma) < np.median(one.sigma)
@@ -142,8 +145,9 @@ def test_shake_is_removed(pattern, truth):
     assert still.valid.mean() > 0.9
 
 
-@pytest.mark.parametrize("width", [0, 20])
-@pytest.mark.parametrize("movement", [(14.3, -3.0, 0.0), (-6.0, 21.0, 0.0), (11.0, 8.0, 0.02)])
+@pytest.mark.parametrize(
+    ("movement", "width"), [((14.3, -3.0, 0.0), 20), ((-6.0, 21.0, 0.0), 0), ((11.0, 8.0, 0.02), 20)]
+)
 def test_a_camera_that_moved_far_is_found_first(pattern, truth, movement, width):
     u, v, roll = movement
     shake = np.stack([u - roll * (ROWS - 45), v + roll * (COLUMNS - 60)], axis=-1)
@@ -160,8 +164,7 @@ def test_a_camera_that_moved_far_is_found_first(pattern, truth, movement, width)
         assert np.isnan(result.pair.flow[(row < -2) | (column < -2)]).all()
 
 
-PEAKS = [("correlation", 12.0, 30.0, 0.99), ("correlation", 16.0, 34.0, 0.9), ("correlation", 25.0, 50.0, 0.9),
-         ("correlation", 20.0, 22.0, 0.0), ("dis", 16.0, 34.0, 0.85)]  # fmt: skip
+PEAKS = [("correlation", 25.0, 50.0, 0.9), ("correlation", 20.0, 22.0, 0.0), ("dis", 16.0, 34.0, 0.85)]
 
 
 @pytest.mark.parametrize(("method", "largest", "radius", "share"), PEAKS)
@@ -169,12 +172,12 @@ def test_displacements_larger_than_the_window_are_right_or_not_valid(method, lar
     shape = (180, 200)
     rows, columns = np.mgrid[: shape[0], : shape[1]].astype(float)
     fine = gaussian_filter(Background("dots", 280.0, 260.0, dot=3.0, seed=2).raster(0.5), 1.0)
+    at = interpolator(fine, lambda pixels: 2 * pixels + 80.5)
     bump = largest * np.exp(-((rows - 85) ** 2 + (columns - 104) ** 2) / radius**2)
     d = np.stack([0.8 * bump, -0.6 * bump], axis=-1)
 
     def exposed(y, x, seed):
-        grey = 3000 * map_coordinates(fine, [2 * y + 80.5, 2 * x + 80.5], order=3, mode="reflect")
-        return grey + 12 * np.random.default_rng(seed).standard_normal(shape)
+        return 3000 * at(y, x) + 12 * np.random.default_rng(seed).standard_normal(shape)
 
     reference, flow = exposed(rows, columns, 0), exposed(rows - d[..., 1], columns - d[..., 0], 1)
     result = measure([reference], [flow], DisplacementSettings(method))

@@ -81,10 +81,14 @@ def moving(n: int, h=48, w=64, top=255) -> np.ndarray:
 LOSSLESS = (("qp", "0"), ("preset", "fast"))
 
 
-@pytest.mark.parametrize("options", [(), (("x264-params", "open-gop=1"),)], ids=["closed", "open"])
-@pytest.mark.parametrize("suffix", [".mp4", ".mkv", ".mov", ".avi"])
+OPEN = (("x264-params", "open-gop=1"),)
+
+
+@pytest.mark.parametrize(
+    ("suffix", "options"), [(".mp4", ()), (".mp4", OPEN), (".mkv", OPEN), (".mov", OPEN), (".avi", OPEN)]
+)
 def test_every_frame_of_a_film_with_reordered_frames(tmp_path, rng, suffix, options):
-    images = moving(50)
+    images = moving(26)
     write_video(tmp_path / f"a{suffix}", images, options=(("qp", "8"), *options))
     with av.open(str(tmp_path / f"a{suffix}")) as film:
         decoded = list(film.decode(video=0))
@@ -93,9 +97,9 @@ def test_every_frame_of_a_film_with_reordered_frames(tmp_path, rng, suffix, opti
     np.testing.assert_allclose(stack, images.astype(float), atol=12)
     frames = open_frames(tmp_path / f"a{suffix}")
     same(frames, stack)
-    for i in rng.permutation(50):
+    for i in rng.permutation(26):
         np.testing.assert_array_equal(frames[i], stack[i])
-    np.testing.assert_allclose(frames.times, np.arange(50) / 30, atol=1e-12)
+    np.testing.assert_allclose(frames.times, np.arange(26) / 30, atol=1e-12)
     assert frames.white == 235
     assert "h264" in frames.notes[0]
     same(pickle.loads(pickle.dumps(frames)), stack)

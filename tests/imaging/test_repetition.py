@@ -37,8 +37,7 @@ def dot_grid(period: float, angle: float = 0.0, perspective: float = 0.0) -> np.
     return grey(x + y > 1)
 
 
-@pytest.mark.parametrize("period", [5.0, 12.4, 30.0])
-@pytest.mark.parametrize("angle", [0.0, 30.0])
+@pytest.mark.parametrize(("period", "angle"), [(5.0, 0.0), (12.4, 30.0), (30.0, 0.0), (30.0, 30.0)])
 def test_a_grid_of_dots_repeats_in_both_directions(period, angle):
     result = repetition(dot_grid(period, angle))
     assert [np.linalg.norm(p) for p in result.periods] == pytest.approx([period] * 2, rel=0.02)
@@ -82,7 +81,7 @@ def test_reach_is_the_part_of_a_period():
 
 @pytest.mark.parametrize("kind", [*KINDS, "noise", "blank"])
 def test_random_patterns_do_not_repeat(kind):
-    for seed, (fill, dot, blur) in enumerate([(0.1, 3, 0), (0.35, 3, 0), (0.35, 2, 2), (0.6, 5, 0), (0.6, 10, 1)]):
+    for seed, (fill, dot, blur) in enumerate([(0.1, 3, 0), (0.35, 2, 2), (0.6, 10, 1)]):
         if kind in KINDS:
             pattern = Background(kind, 260, 220, dot=dot, fill=fill, seed=seed).raster(1.0)
         else:

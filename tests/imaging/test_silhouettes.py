@@ -15,14 +15,17 @@ from nerif.data.body_file import read_body
 from nerif.data.measurement import Measurement
 from nerif.data.measurement_sequence import MeasurementSequence
 from nerif.fields.phantoms import make_phantom
-from nerif.geometry import Box, Ring
+from nerif.geometry import Box, Grid, Ring
 from nerif.geometry.body import contained, hidden_pixels
 from nerif.geometry.pose import rotation_matrix
 from nerif.imaging.bodies import film_with_bodies, with_bodies
 from nerif.imaging.silhouettes import drawn_silhouettes, hull_of_silhouettes, outline, refine_pose
 from nerif.simulation.simulate import simulate
+from nerif.workflow.sequence.chunk import reconstruct_frames
+from nerif.workflow.sequence.plan import SequencePlan, SequenceSettings
 from nerif.workflow.sequence.store import SequenceStore
 from refusals import refused
+from sequence_films import COLD
 
 BOX = Box.cube(40.0)
 BRICK = cuboid((-8.0, -5.0, -3.0), (8.0, 5.0, 3.0), name="brick")
@@ -31,7 +34,7 @@ BRICK = cuboid((-8.0, -5.0, -3.0), (8.0, 5.0, 3.0), name="brick")
 @pytest.fixture(scope="module")
 def flow() -> Measurement:
     ring = Ring(views=5, arc=(0.0, 150.0), image_size=(64, 64), pixel_pitch=0.05)
-    return simulate(make_phantom("gaussians", BOX, 0), ring.cameras(), BOX, 1.00027, 0.05, seed=1)
+    return simulate(make_phantom("gaussians", BOX, 0), ring.cameras(), BOX, 1.00027, 0.05, seed=1, steps=30)
 
 
 def turned(body, degrees=(2.0, -3.0, 1.5), shift=(0.6, -0.4, 0.8)):
@@ -65,9 +68,9 @@ def test_the_pose_of_a_body_is_that_of_its_outlines(flow):
 
 
 def test_turns_of_a_ball_are_not_determined(flow):
-    there = ball(6.0, (1.0, -2.0, 0.5))
+    there = ball(6.0, (1.0, -2.0, 0.5), rings=16)
     masked = with_bodies(flow, [there])
-    pose = refine_pose(masked, ball(6.0, (0.2, -1.5, 0.0)))
+    pose = refine_pose(masked, ball(6.0, (0.2, -1.5, 0.0), rings=16))
     assert {name for name in pose.unknown if name.startswith("turn")} == {f"turn about {axis}" for axis in "xyz"}
     torch.testing.assert_close(pose.body.vertices.mean(dim=0), there.vertices.mean(dim=0), atol=0.15, rtol=0)
     assert "not determined: turn about" in pose.sentence
@@ -84,10 +87,10 @@ def test_an_outline_far_away_is_refused(flow):
 
 
 def test_the_hull_of_silhouettes_contains_the_body(flow):
-    there = ball(7.0, (1.0, 2.0, -1.0))
+    there = ball(7.0, (1.0, 2.0, -1.0), rings=20)
     silhouettes = torch.stack([hidden_pixels(camera, [there]) for camera in flow.cameras])
     hull = hull_of_silhouettes(flow, silhouettes, 64)
-    inner = ball(6.5, (1.0, 2.0, -1.0)).vertices
+    inner = ball(6.5, (1.0, 2.0, -1.0), rings=20).vertices
     assert bool(contained([hull], inner).all())
     assert 1.0 < hull.volume / there.volume < 1.4
     with refused("silhouettes"):
@@ -95,7 +98,7 @@ def test_the_hull_of_silhouettes_contains_the_body(flow):
 
 
 def test_silhouettes_on_the_command_line(flow, tmp_path, capsys):
-    there, folder = turned(BRICK), tmp_path / "drawn"
+    there, folder, flow = turned(BRICK), tmp_path / "drawn", flow.without(flow.names[3:])
     folder.mkdir()
     for name, camera in zip(flow.names, flow.cameras, strict=True):
         Image.fromarray(hidden_pixels(camera, [there]).numpy().astype(np.uint8) * 255).save(folder / f"{name}.png")
@@ -136,7 +139,6 @@ def test_a_body_that_moves_in_a_film(film, tmp_path, capsys):
     assert bool((first.hidden != second.hidden).any())
     there = turned(BRICK, (0.0, 0.0, 5.0), (1.5, 0.0, -1.0))
     torch.testing.assert_close(second.bodies[0].extent[1], there.extent[1], atol=1e-5, rtol=0)
-    (tmp_path / "short.csv").write_text(POSES.rsplit("\n", 2)[0] + "\n")
     for content, message in (
         (POSES.rsplit("\n", 2)[0], "expected 2 rows"),
         ("a,b\n1,2\n", "columns rx"),
@@ -151,10 +153,12 @@ def test_a_body_that_moves_in_a_film(film, tmp_path, capsys):
         assert field in capsys.readouterr().err
     assert main([*words[:4], str(tmp_path / "poses.csv"), "-o", str(film.path), "--force"]) == 2
     assert "frame by frame" in capsys.readouterr().err
-    quick = ["--max-steps", "20", "--network.width", "16", "--voxels", "24", "--device", "cpu"]
-    store = tmp_path / "result.zarr"
-    assert main(["sequence", str(moving.path), "-o", str(store), *quick]) == 0
-    result = SequenceStore(store)
+    cold, grid = replace(COLD, max_steps=3), Grid.of_resolution(BOX, 16)
+    settings = SequenceSettings(warm_steps=3, voxels=16, quantities=("index_excess",))
+    plan = SequencePlan(moving.path, tmp_path / "r.zarr", cold, settings)
+    SequenceStore.begin(plan.out, moving, grid, settings.quantities, cold.network, plan.attributes)
+    reconstruct_frames(plan, 0, 2)
+    result = SequenceStore(plan.out)
     for index, measurement in enumerate((first, second)):
         volume = result.volume(index, "index_excess")
         inside = contained(measurement.bodies, volume.grid.points())

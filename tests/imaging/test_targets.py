@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 
 from calibration_images import camera_at_origin, imaged
-from nerif.geometry import Camera
 from nerif.imaging.calibration.targets import CalibrationTarget
 
 TARGETS = {
@@ -16,9 +17,13 @@ TARGETS = {
 }
 
 
-@pytest.fixture(scope="module")
-def camera() -> Camera:
-    return camera_at_origin((-0.1, 0.05, 0.001, -0.001, 0))
+TILTED = (25, -20, 8)
+
+
+@cache
+def photograph(target: CalibrationTarget, angles: tuple[float, float, float]) -> tuple[np.ndarray, np.ndarray]:
+    """An image of 12 bit, and the true points."""
+    return imaged(target, camera_at_origin((-0.1, 0.05, 0.001, -0.001, 0)), angles)
 
 
 def errors(target: CalibrationTarget, image: np.ndarray, truth: np.ndarray) -> np.ndarray:
@@ -29,24 +34,24 @@ def errors(target: CalibrationTarget, image: np.ndarray, truth: np.ndarray) -> n
 
 
 @pytest.mark.parametrize("kind", TARGETS)
-@pytest.mark.parametrize("angles", [(0, 0, 0), (25, -20, 8), (-15, 30, -12)])
-def test_points_are_detected_where_they_are(camera, kind, angles):
-    image, truth = imaged(TARGETS[kind], camera, angles)
+@pytest.mark.parametrize("angles", [(0, 0, 0), TILTED])
+def test_points_are_detected_where_they_are(kind, angles):
+    image, truth = photograph(TARGETS[kind], angles)
     error = errors(TARGETS[kind], image, truth)
     assert len(error) > 0.8 * len(truth)
     assert np.sqrt(np.mean(error**2)) < (0.03 if kind == "circles" else 0.02)
 
 
 @pytest.mark.parametrize(("kind", "turn"), [("chessboard", 180.0), ("chessboard", 90.0), ("charuco", 180.0)])
-def test_a_rotated_target_keeps_its_numbers(camera, kind, turn):
+def test_a_rotated_target_keeps_its_numbers(kind, turn):
     target = CalibrationTarget(kind, 8, 7, pitch=6.0)
-    assert np.abs(errors(target, *imaged(target, camera, (10, 5, turn)))).max() < 0.2
+    assert np.abs(errors(target, *photograph(target, (10, 5, turn)))).max() < 0.2
 
 
 @pytest.mark.parametrize("kind", TARGETS)
-def test_white_on_black(camera, kind):
+def test_white_on_black(kind):
     target = TARGETS[kind]
-    image, truth = imaged(target, camera, (20, -15, 5))
+    image, truth = photograph(target, TILTED)
     black = image.max() - image
     # a chessboard of an odd and an even number of squares is its own negative turned by 180 degrees
     truth = truth[::-1] if kind == "chessboard" else truth
@@ -55,15 +60,15 @@ def test_white_on_black(camera, kind):
 
 
 @pytest.mark.parametrize(("kind", "columns", "rows"), [("circles", 8, 6), ("circles", 9, 5), ("charuco", 9, 6)])
-def test_a_part_of_a_larger_target_is_not_detected(camera, kind, columns, rows):
-    image, _ = imaged(TARGETS[kind], camera, (10, 5, 3))
+def test_a_part_of_a_larger_target_is_not_detected(kind, columns, rows):
+    image, _ = photograph(TARGETS[kind], TILTED)
     assert CalibrationTarget(kind, columns, rows, pitch=7.0).detect(image) is None
 
 
 @pytest.mark.parametrize("turn", [-60, 80])
-def test_a_turned_grid_of_dots_keeps_its_numbers(camera, turn):
+def test_a_turned_grid_of_dots_keeps_its_numbers(turn):
     target = CalibrationTarget("circles", 7, 6, pitch=6.0)
-    assert np.abs(errors(target, *imaged(target, camera, (10, 5, turn)))).max() < 0.2
+    assert np.abs(errors(target, *photograph(target, (10, 5, turn)))).max() < 0.2
 
 
 def test_dots_and_markers_of_any_size_in_a_large_image():
@@ -78,15 +83,15 @@ def test_dots_and_markers_of_any_size_in_a_large_image():
         assert np.abs(shift - shift.mean(axis=0)).max() < 0.2
 
 
-@pytest.mark.parametrize("bits", [8, 16])
-def test_any_bit_depth(camera, bits):
-    target = TARGETS["chessboard"]
-    assert np.abs(errors(target, *imaged(target, camera, (10, 10, 0), bits))).max() < 0.1
+def test_any_bit_depth():
+    image, truth = photograph(TARGETS["chessboard"], TILTED)
+    for other in ((image >> 4).astype(np.uint8), image << 4):
+        assert np.abs(errors(TARGETS["chessboard"], other, truth)).max() < 0.1
 
 
-def test_a_charuco_board_may_be_partly_hidden(camera):
-    image, truth = imaged(TARGETS["charuco"], camera, (5, 5, 0))
-    image[:90] = 900
+def test_a_charuco_board_may_be_partly_hidden():
+    image, truth = photograph(TARGETS["charuco"], (0, 0, 0))
+    image = np.where(np.arange(len(image))[:, None] < 90, np.uint16(900), image)
     error = errors(TARGETS["charuco"], image, truth)
     assert 6 <= len(error) < 48
     assert np.abs(error).max() < 0.3

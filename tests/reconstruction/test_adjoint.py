@@ -48,7 +48,7 @@ def rays_of(geometry: str) -> Rays:
     cameras = tuple(replace(camera, lens=LENSES.get(geometry)) for camera in RING.cameras())
     each = [c.rays(c.pixel_grid().reshape(-1, 2), view=i) for i, c in enumerate(cameras)]
     rays = Rays.concatenate(each).clip(BOX)
-    return rays[rays.crosses][::7].to(dtype=torch.float64)
+    return rays[rays.crosses][::13].to(dtype=torch.float64)
 
 
 def operator(

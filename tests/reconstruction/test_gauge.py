@@ -9,14 +9,18 @@ import torch
 
 from bodies import cuboid
 from nerif.data.measurement import Measurement
+from nerif.fields.network_shape import NetworkShape
 from nerif.geometry import Grid
 from nerif.reconstruction.gauge import Gauge, free_voxels, with_gauge
-from nerif.reconstruction.neural.presets import preset
+from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from refusals import refused
 
-QUICK = replace(preset("fast"), max_steps=300, device="cpu")
-SMOOTH = Tikhonov(voxels=24, device="cpu")
+QUICK = NeRIF(
+    network=NetworkShape(depth=2, width=32, octaves=2), samples=(12, 16), points_per_batch=1024, max_steps=120,
+    device="cpu", precision="float32",
+)  # fmt: skip
+SMOOTH = Tikhonov(voxels=16, device="cpu")
 METHODS = pytest.mark.parametrize("method", [QUICK, SMOOTH], ids=["nerif", "tikhonov"])
 
 

@@ -159,10 +159,10 @@ def test_a_rig_and_detail_beside_voxels_mix_no_devices(measurement, gpu, monkeyp
         voxels=8, iterations=1, regularisation=1e-3, symmetry=symmetry, axis_sigma_mm=0.0, axis_sigma_deg=0.0,
         refine=("cameras",), coarse_to_fine=False, device=str(GPU),
     )  # fmt: skip
-    two, withheld = measurement.select(measurement.names[:2]), measurement.select(measurement.names[2:3])
+    one, withheld = (measurement.select([name]) for name in measurement.names[:2])
     with gpu:
-        result = settings(two)
-        detail = Detail(result.field, two, replace(settings, model="curved"), result.axis, 1, 8)
+        result = settings(one)
+        detail = Detail(result.field, one, replace(settings, model="curved"), result.axis, 1, 8)
         posterior = detail.solve(detail.first(blurred=True), iterations=1)
         error = detail.prediction_error(detail.others(withheld), posterior.coefficients)
     assert result.device == device

@@ -67,11 +67,11 @@ def test_the_terms_of_the_paper_agree_on_a_fitted_field(measurement):
     settings = replace(
         SMALL, network=NetworkShape(depth=3, width=48, octaves=2, skip=2, head_width=16, gradient_head=True),
         weights=LossWeights(consistency=1, numerical=1, head=1, automatic=0), norm="l2", max_steps=150,
-        samples=(16, 24),
+        samples=(16, 24), points_per_batch=2048,
     )  # fmt: skip
     result = settings(measurement)
     assert set(result.history[-1]) >= {"consistency", "numerical", "head", "gauge", "loss"}
-    last = [record["loss"] for record in result.history[-4:]]  # each of a batch of 70 rays
+    last = [record["loss"] for record in result.history[-4:]]  # of batches of 85 rays; of 43, the first varies by 2
     assert sum(last) / len(last) < 0.25 * result.history[0]["loss"]
     field, step = result.field, 1e-2
     p = field.normalise(Grid.of_resolution(measurement.box, 12).points().reshape(-1, 3))
@@ -145,7 +145,7 @@ def test_a_non_finite_loss_rolls_back_and_in_the_end_stops(measurement, monkeypa
 def test_a_collapsed_field_is_rolled_back(measurement, monkeypatch):
     """Weights set to 0 in the middle of a good run."""
     monkeypatch.setattr(watch, "SAVE_EVERY", 40)
-    run, steps = trainer.Trainer(replace(SMALL, max_steps=200), TrainingData(SMALL, measurement)), []
+    run, steps = trainer.Trainer(replace(SMALL, max_steps=140), TrainingData(SMALL, measurement)), []
 
     def sabotage(step: Step) -> None:
         if step.step == 100 and 100 not in steps:
@@ -164,7 +164,7 @@ def test_a_collapsed_field_is_rolled_back(measurement, monkeypatch):
 )
 def test_waves_shorter_than_the_pixels_are_left_out(pixels, octaves):
     cameras, box = paper_rig(pixels)
-    measured = simulate(make_phantom("gaussians", box, 0), cameras[:2], box, 1.00027, 0.02, 0)
+    measured = simulate(make_phantom("gaussians", box, 0), cameras[:2], box, 1.00027, steps=2)
     edge, shortest = box.edges[0], 2.5 * max(measured.pixel_sizes)
     resolved = NeRIF().resolved_by(measured)
     assert resolved.network.octaves == octaves

@@ -15,7 +15,7 @@ from nerif.reconstruction.voxels.layout import layout_of
 from nerif.reconstruction.voxels.voxel_problem import Problem
 
 SHAPE = (5, 6, 7)  # z, y, x
-ITERATIONS = 40
+ITERATIONS = 30
 
 
 @pytest.fixture(scope="module")
@@ -100,7 +100,7 @@ def test_conjugate_gradients_reach_the_posterior_mean(white, prior):
 
 def test_draws_have_mean_and_covariance_of_the_posterior(white, prior):
     mean, covariance = analytic(white)
-    generator, count = torch.Generator().manual_seed(11), 100
+    generator, count = torch.Generator().manual_seed(11), 40
     z = mean.reshape(SHAPE)
     draws = torch.stack([after(white.draw(z, generator), ITERATIONS).flatten() for _ in range(count)])
     matrix = fields(prior)

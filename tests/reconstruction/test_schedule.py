@@ -201,7 +201,7 @@ def test_durations(seconds, text):
 def test_a_run_shows_the_warning_in_terminal_and_app(measurement, tmp_path, slow_clock):
     slow_clock(1.0)
     lines: list[str] = []
-    settings = replace(SMALL, time_limit=400.0, max_steps=1000)
+    settings = replace(SMALL, time_limit=100.0, max_steps=1000)
     run = RunSettings(withhold=("auto",), report=False)
     reconstruct_into(tmp_path / "r", measurement, settings, run, voxels=8, monitor=Monitor(lines.append), live=True)
     (line,) = [line for line in lines if line.startswith("slow: ")]

@@ -35,8 +35,8 @@ SIDES = ("x-", "x+", "y-", "y+")
 
 @pytest.fixture(scope="module")
 def jet():
-    cameras, box = paper_rig(40)
-    return simulate(make_phantom("gaussian-jet", box, 0), cameras[:2], box, 1.00027, 0.03, 0)
+    cameras, box = paper_rig(28)
+    return simulate(make_phantom("gaussian-jet", box, 0), cameras[:2], box, 1.00027, 0.03, 0, steps=30)
 
 
 def one_view(measurement):
@@ -51,7 +51,7 @@ def error(result, box, truth=None):
 
 @pytest.mark.parametrize(
     ("method", "most"),
-    [(Tikhonov(voxels=40), 0.03), pytest.param(TotalVariation(voxels=40), 0.03, marks=pytest.mark.slow),
+    [(Tikhonov(voxels=28), 0.03), pytest.param(TotalVariation(voxels=40), 0.03, marks=pytest.mark.slow),
      pytest.param(Landweber(voxels=40), 0.06, marks=pytest.mark.slow),
      pytest.param(NeRIF(max_steps=120), 0.03, marks=pytest.mark.slow)],
 )  # fmt: skip
@@ -92,11 +92,11 @@ def test_two_views_determine_the_axis():
 
 
 @pytest.mark.parametrize(("along", "stated", "better"), [
-    ("x", None, (1.0, 0.0, 0.0)), ("z", None, ()), ("x", (0.0, 0.0, 1.0), ()), ("x", (1.0, 0.0, 0.0), ()),
+    ("x", None, (1.0, 0.0, 0.0)), ("z", None, ()), ("x", (0.0, 0.0, 1.0), ()),
 ])  # fmt: skip
 def test_a_jet_along_another_edge_of_the_box_is_noticed(along, stated, better):
     box = Box.cube(50.0)
-    ring = Ring(views=1, arc=(90.0, 90.0), image_size=(20, 20), pixel_pitch=0.2)
+    ring = Ring(views=1, arc=(90.0, 90.0), image_size=(14, 16), pixel_pitch=0.25)
     measurement = simulate(make_phantom("plume", box), ring.cameras(), box, 1.00027, 0.02, steps=30)
     if along == "x":  # the rig is turned about y instead
         turn = torch.tensor([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]], dtype=torch.float64)
@@ -171,11 +171,11 @@ class Sheet(Field):
         return value, -2 / 40 * value[..., None] * off
 
 
-@pytest.mark.parametrize("method", [Tikhonov(voxels=32), pytest.param(NeRIF(max_steps=100), marks=pytest.mark.slow)])
+@pytest.mark.parametrize("method", [Tikhonov(voxels=20), pytest.param(NeRIF(max_steps=100), marks=pytest.mark.slow)])
 def test_a_planar_flow_from_the_view_along_it(method):
     box = Box.around_origin((50.0, 20.0, 50.0))
-    camera = paper_rig(32)[0][4:5]  # the one that looks along y
-    measured = simulate(Sheet(), camera, box, 1.00027, 0.02, 0)
+    camera = paper_rig(24)[0][4:5]  # the one that looks along y
+    measured = simulate(Sheet(), camera, box, 1.00027, 0.02, 0, steps=30)
     result = replace(method, symmetry="planar")(replace(measured, ambient_faces=("x-", "x+")))
     assert abs(result.axis.symmetry.direction[1]) > 0.99
     assert error(result, box, Sheet()) < 0.05

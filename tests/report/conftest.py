@@ -12,7 +12,7 @@ import pytest
 from nerif.cli.cli import main
 from report.browsing import open_browser
 
-RIG = ["--image-size", "18", "22", "--pixel-pitch", "0.2", "--views", "4", "--steps", "40", "--truth-voxels", "16"]
+RIG = ["--image-size", "18", "22", "--pixel-pitch", "0.2", "--views", "4", "--steps", "20", "--truth-voxels", "16"]
 QUICK = [
     "--network.depth", "2", "--network.width", "24", "--network.octaves", "2", "--max-steps", "60",
     "--samples", "12", "16", "--sample-jitter", "2", "--points-per-batch", "600", "--voxels", "16", "--device", "cpu",

@@ -127,7 +127,8 @@ def test_pixels_that_a_body_hides_are_counted(tmp_path, capsys):
 
     body = cuboid((-5.0, -5.0, -5.0), (5.0, 5.0, 5.0))
     trimesh.Trimesh(body.vertices.numpy(), body.faces.numpy()).export(tmp_path / "cube.stl")
-    assert main(["design", "--views", "3", "--body", str(tmp_path / "cube.stl")]) == 0
+    rig = ["--views", "3", "--image-size", "32", "32", "--pixel-pitch", "0.125"]
+    assert main(["design", *rig, "--body", str(tmp_path / "cube.stl")]) == 0
     shares = re.findall(r"hidden in view \S+ +([\d.]+)%", capsys.readouterr().out)
     assert len(shares) == 3
     assert all(1 < float(share) < 90 for share in shares)

@@ -28,16 +28,25 @@ from nerif.workflow.cross_validation import MIN_VIEWS, CrossValidation, withheld
 from nerif.workflow.pipeline import reconstruct_into
 from nerif.workflow.run_settings import RunSettings
 
-VOXELS = Tikhonov(voxels=16, basis="linear", iterations=8, regularisation=0.1, device="cpu")
+VOXELS = Tikhonov(voxels=10, basis="linear", iterations=8, regularisation=0.1, device="cpu")
 SHAPE = NetworkShape(depth=2, width=24, octaves=2)
-NETWORK = NeRIF(network=SHAPE, max_steps=60, points_per_batch=600, precision="float32", device="cpu")
+NETWORK = NeRIF(network=SHAPE, max_steps=40, points_per_batch=600, precision="float32", device="cpu")
 SILENT = RunSettings(report=False)
 
 
+@pytest.fixture(scope="module")
+def complete(measurement, tmp_path_factory) -> tuple[ResultDirectory, list[str]]:
+    """A result of VOXELS, and what was printed."""
+    out, lines = ResultDirectory(tmp_path_factory.mktemp("complete") / "r"), []
+    reconstruct_into(out.path, measurement, VOXELS, SILENT, monitor=Monitor(lines.append))
+    return out, lines
+
+
 @pytest.mark.parametrize("method", [VOXELS, NETWORK], ids=["voxels", "network"])
-def test_a_view_is_predicted_before_it_is_used(measurement, tmp_path, method):
-    out, lines = ResultDirectory(tmp_path / "r"), []
-    reconstruct_into(out.path, measurement, method, SILENT, monitor=Monitor(lines.append))
+def test_a_view_is_predicted_before_it_is_used(measurement, complete, tmp_path, method):
+    out, lines = complete if method is VOXELS else (ResultDirectory(tmp_path / "r"), [])
+    if method is NETWORK:
+        reconstruct_into(out.path, measurement, method, SILENT, voxels=10, monitor=Monitor(lines.append))
     result, name = out.read(), best_covered(measurement.cameras)[0]
     (score,) = result.metrics.cross_validation["views"]
     assert (score["name"], score["withheld"]) == (name, True)
@@ -74,27 +83,25 @@ def test_the_field_of_the_short_run_is_seen_by_the_cameras_that_it_refined(measu
             assert after["rms_over_sigma"] < 2 < 0.2 * before["rms_over_sigma"]
 
 
-def test_the_short_run_does_not_depend_on_the_withheld_view(measurement, tmp_path):
+def test_the_short_run_does_not_depend_on_the_withheld_view(measurement, complete, tmp_path):
     name = best_covered(measurement.cameras)[0]
     view = torch.tensor([n == name for n in measurement.names])[:, None, None, None]
     other = replace(measurement, displacement=torch.where(view, -measurement.displacement, measurement.displacement))
-    scores = []
-    for number, data in enumerate((measurement, other)):
-        reconstruct_into(tmp_path / str(number), data, VOXELS, SILENT)
-        scores.append(ResultDirectory(tmp_path / str(number)).metrics().cross_validation["views"][0]["cc"])
+    reconstruct_into(tmp_path / "r", other, VOXELS, SILENT)
+    results = complete[0], ResultDirectory(tmp_path / "r")
+    scores = [result.metrics().cross_validation["views"][0]["cc"] for result in results]
     assert scores[0] == pytest.approx(-scores[1], abs=1e-6)
 
 
 @pytest.mark.parametrize("reason", ["none", "72deg", "few views", "start"])
-def test_skipped(measurement, tmp_path, reason):
+def test_skipped(measurement, complete, tmp_path, reason):
     run, withhold = SILENT, [] if reason != "72deg" else [reason]
     if reason in ("none", "72deg"):
         run = replace(run, withhold=(reason,))
     elif reason == "few views":
         measurement = measurement.select(measurement.names[: MIN_VIEWS - 1])
     else:  # an initial field that depends on all views
-        reconstruct_into(tmp_path / "start", measurement, VOXELS, SILENT)
-        run = replace(run, start_from=tmp_path / "start")
+        run = replace(run, start_from=complete[0].path)
     out = ResultDirectory(tmp_path / "r")
     reconstruct_into(out.path, measurement, VOXELS, run)
     assert out.metrics().cross_validation is None
@@ -112,9 +119,9 @@ def test_views_may_have_the_names_of_options():
 @pytest.mark.parametrize("in_short_run", [True, False])
 def test_an_interrupted_run_resumes_to_the_same_result(measurement, tmp_path, in_short_run):
     complete, out = ResultDirectory(tmp_path / "complete"), ResultDirectory(tmp_path / "interrupted")
-    reconstruct_into(complete.path, measurement, NETWORK, SILENT)
+    reconstruct_into(complete.path, measurement, NETWORK, SILENT, voxels=10)
     short = Monitor(training=lambda title: nullcontext(lambda step: "without" in title and step.step == 5))
-    stop = {"monitor": short} if in_short_run else {"on_step": lambda step: step.step == 30}
+    stop = {"monitor": short} if in_short_run else {"on_step": lambda step: step.step == 20}
     first = reconstruct_into(out.path, measurement, NETWORK, SILENT, **stop)
     assert first.outcome.reason == "interrupted"
     withheld = [v["name"] for v in out.metrics().views if v["withheld"]]

@@ -34,7 +34,7 @@ def truth():
 def turbulence(truth):
     """Six views of a turbulent plume."""
     ring = Ring(views=6, arc=(0.0, 150.0), image_size=(30, 30), pixel_pitch=0.13)
-    return simulate(truth, ring.cameras(), BOX, 1.00027, 0.05, seed=2, steps=40)
+    return simulate(truth, ring.cameras(), BOX, 1.00027, 0.05, seed=2, steps=20)
 
 
 @pytest.fixture(scope="module")
@@ -142,7 +142,7 @@ def test_the_commands_take_a_result_with_detail(made, turbulence, tmp_path):
     assert main(["export", out, "-o", str(tmp_path / "v.npz")]) == 0
     assert main(["report", out]) == 0
     again = str(tmp_path / "again")
-    words = ["reconstruct", str(path), "-o", again, "--method", "gp", "--voxels", "20", "--no-report"]
+    words = ["reconstruct", str(path), "-o", again, "--method", "gp", "--voxels", "12", "--no-report"]
     assert main([*words, "--start-from", out]) == 0
     assert ResultDirectory(again).settings()["method"] == "gp"
 

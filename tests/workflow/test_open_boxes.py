@@ -11,7 +11,7 @@ from nerif.analysis.evaluation import evaluate
 from nerif.fields.network import NetworkShape
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Ring
-from nerif.reconstruction.neural.presets import preset
+from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
 from nerif.results.directory import ResultDirectory
 from nerif.simulation.simulate import simulate
@@ -23,16 +23,19 @@ from refusals import refused
 WHOLE, CUT = Box.cube(40.0), Box((-20.0, -20.0, -20.0), (20.0, 20.0, 2.0))
 QUIET = RunSettings(report=False, withhold=(), detail="off", extend_open_faces=8.0)
 SHAPE = NetworkShape(depth=2, width=32, octaves=3)
-SHORT = replace(preset("fast"), network=SHAPE, max_steps=150, open_faces=("z+",), device="cpu")
-VOXELS = Tikhonov(voxels=20, open_faces=("z+",), device="cpu")
+SHORT = NeRIF(
+    network=SHAPE, samples=(12, 16), points_per_batch=1024, max_steps=150, open_faces=("z+",), device="cpu",
+    precision="float32",
+)  # fmt: skip
+VOXELS = Tikhonov(voxels=16, open_faces=("z+",), device="cpu")
 
 
 @pytest.fixture(scope="module")
 def cut():
     """A flow that passes through the face z+, in views from above and below."""
-    ring = Ring(views=5, arc=(0.0, 144.0), elevation=15.0, image_size=(40, 40), pixel_pitch=0.08)
+    ring = Ring(views=5, arc=(0.0, 144.0), elevation=15.0, image_size=(24, 26), pixel_pitch=0.13)
     field = make_phantom("gaussians", WHOLE, 1)
-    return replace(simulate(field, ring.cameras(), WHOLE, 1.00027, 0.05, seed=1), box=CUT), field
+    return replace(simulate(field, ring.cameras(), WHOLE, 1.00027, 0.05, seed=1, steps=30), box=CUT), field
 
 
 def test_the_box_grows_through_the_named_faces():
@@ -46,7 +49,7 @@ def test_growing_keeps_the_size_of_voxels_and_the_other_ambient_faces(cut):
     assert larger.box.upper == (20.0, 20.0, 10.0)
     assert larger.ambient_faces == ("x-",)
     assert settings.open_faces == ()
-    assert settings.voxels == 20  # the longest edge is across
+    assert settings.voxels == 16  # the longest edge is across
     with refused("extend_open_faces"):
         grown(measurement, replace(SHORT, open_faces=()), 8.0)
 
@@ -55,7 +58,7 @@ def test_growing_keeps_the_size_of_voxels_and_the_other_ambient_faces(cut):
 def test_the_result_is_that_of_the_box(cut, method, tmp_path):
     measurement, truth = cut
     measurement.write(tmp_path / "m.nc")
-    result = reconstruct_into(tmp_path / "r", tmp_path / "m.nc", method, QUIET)
+    result = reconstruct_into(tmp_path / "r", tmp_path / "m.nc", method, QUIET, voxels=16)
     assert result.box == CUT
     directory = ResultDirectory(tmp_path / "r")
     field, box, _ = directory.field()
@@ -69,6 +72,7 @@ def test_the_result_is_that_of_the_box(cut, method, tmp_path):
     evaluate(tmp_path / "r", measurement=tmp_path / "m.nc")
     after = directory.metrics().views
     assert [view["rms"] for view in after] == pytest.approx([view["rms"] for view in before], rel=0.02)
-    left_out = reconstruct_into(tmp_path / "left-out", tmp_path / "m.nc", method, replace(QUIET, extend_open_faces=0.0))
+    without = replace(QUIET, extend_open_faces=0.0)
+    left_out = reconstruct_into(tmp_path / "left-out", tmp_path / "m.nc", method, without, voxels=16)
     errors = [float((r.field(points) - truth(points)).norm()) for r in (result, left_out)]
     assert errors[0] < errors[1]

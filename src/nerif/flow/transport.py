@@ -40,7 +40,7 @@ class Path:
     place: Int[Tensor, n]  #: voxel halfway, of all in the volume
     inside: Bool[Tensor, m]  #: which of the points of the interval have such a path
     start: Float[Tensor, "n 3"]  #: x, y, z in voxels from the second layer beyond the faces
-    end: Float[Tensor, "n 3"]  #: likewise
+    end: Float[Tensor, "n 3"]  #: in the same unit
 
 
 class Transport:

@@ -63,6 +63,7 @@ def test_the_velocity_improves_the_densities_if_the_measurement_is_there(result:
 def test_one_command_makes_film_and_velocity(result: Path, five: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     name = "nerif.workflow.sequence.reconstruct_sequence.reconstruct_sequence"
     monkeypatch.setattr(name, lambda out, *_, **__: SequenceStore(out))
+    monkeypatch.setattr("nerif.report.velocity_page.image", lambda *_: "")
     settings = {"physics": "transport", "resolution": 8, "max-iterations": 2, "samples": 0}
     options = [word for name, value in settings.items() for word in (f"--flow.{name}", value)]
     assert run("sequence", five, "-o", result, "--velocity", tmp_path / "v.zarr", *options) == 0

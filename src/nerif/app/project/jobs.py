@@ -55,7 +55,7 @@ class CommandRun:
     pid: int = 0  #: process id while it runs
     code: int | None = None  #: exit code after the end
     started: float = 0.0  #: seconds since 1970, 0 before
-    ended: float = 0.0  #: likewise
+    ended: float = 0.0  #: seconds since 1970, 0 before
 
     @property
     def line(self) -> str:

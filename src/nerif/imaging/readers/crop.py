@@ -24,7 +24,7 @@ class Crop:
     row: Pixels = 0  #: of the top-left pixel
     column: Pixels = 0  #: of the top-left pixel
     height: Pixels = 0  #: px; 0 for all up to the edge of the frame
-    width: Pixels = 0  #: likewise
+    width: Pixels = 0  #: px; 0 for all up to the edge of the frame
     flip: str = ""  #: "", "horizontal" (exchanges left and right), "vertical" or "both"
     rotate: int = 0  #: 0, 90, 180 or 270 degrees counter-clockwise
 
