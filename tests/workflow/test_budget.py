@@ -57,7 +57,7 @@ def test_the_limit_counts_from_the_start_and_reserves_time_for_the_rest(measurem
         (60.0, 10.0, 0.1, ()),  # 417 steps
         (60.0, 10.0, 0.3, ("139 steps", "--time-limit 160 or more")),  # a slow machine
         (60.0, 50.0, 0.0, ("50 s", "8.3 s for the fit.", "--time-limit 100 or more")),  # voxels have no pace
-        (60.0, 45.0, 0.0, ()),
+        (60.0, 38.0, 0.0, ()),
         (60.0, 70.0, 0.1, ("5 s for the fit, about 50 steps", "--time-limit 140 or more")),  # nothing is left
         (0.0, 70.0, 0.1, ()),
     ],

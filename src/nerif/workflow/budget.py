@@ -31,7 +31,7 @@ STEP = 3.2  # time of a training step per point, in evaluations: measured on a C
 FEW = 0.5  # of the steps to the first convergence check: fits of fewer are poor (docs/decisions/020)
 TRAINING = "steps", "the time in which this machine evaluates the network"
 ITERATIONS = "iterations on the finest grid", "the speed of a usual CPU"
-LITTLE = 0.2  # of the limit: too little for the fits
+LITTLE = 1 / 3  # of the limit: too little for the fits
 
 R = TypeVar("R", bound=Reconstructor)
 
