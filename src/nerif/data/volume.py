@@ -156,7 +156,7 @@ def export(path: str | os.PathLike[str], volumes: list[Volume], force: bool = Fa
 def write_netcdf(path: str | os.PathLike[str], volumes: list[Volume]) -> None:
     """Write volumes on one grid to a NetCDF-4 file with CF conventions, coordinates in mm, atomically."""
     dataset = to_dataset(volumes)
-    encoding = {str(name): {"zlib": True, "complevel": 4} for name in dataset.data_vars}
+    encoding = {str(name): {"zlib": True, "complevel": 1, "shuffle": True} for name in dataset.data_vars}
     write_dataset(path, dataset, encoding)
 
 
