@@ -55,7 +55,7 @@ def test_detail_is_added_where_it_predicts_the_withheld_view(made, truth):
     assert any("withheld view" in line and "sigma" in line for line in lines)
     field = out.field()[0]
     assert isinstance(field, SumField)
-    points = torch.rand(40, 3) * 20 - 10
+    points = torch.rand(4000, 3) * 20 - 10
     torch.testing.assert_close(field(points), result.field(points), rtol=1e-5, atol=1e-12)
     grid = out.volumes()["index_excess"].grid
     without, whole = (f.sample(grid) - truth.sample(grid) for f in (field.parts[0], field))
@@ -90,7 +90,7 @@ def test_a_run_that_is_resumed_has_the_same_detail(made, turbulence, tmp_path):
     stopped = reconstruct_into(path, turbulence, METHOD, RunSettings(report=False), on_step=stop)
     assert stopped.outcome.reason == "interrupted"
     resumed = reconstruct_into(path, turbulence, METHOD, RunSettings(report=False), resume=True)
-    points = torch.rand(40, 3) * 20 - 10
+    points = torch.rand(4000, 3) * 20 - 10
     expected = made[1].field(points)  # total variation has other weights after an interruption
     assert float((resumed.field(points) - expected).norm()) < 0.05 * float(expected.norm())
     assert ResultDirectory(path).metrics().detail is not None
@@ -105,7 +105,7 @@ def test_an_interruption_loses_nothing_of_the_fit(turbulence, tmp_path, monkeypa
         patch.setattr(DetailChoice, "solve", interrupt)
         with pytest.raises((KeyboardInterrupt, SystemExit)):
             reconstruct_into(out.path, turbulence, METHOD, run)
-    points = torch.rand(40, 3) * 20 - 10
+    points = torch.rand(4000, 3) * 20 - 10
     before = out.field()[0](points)
     result = reconstruct_into(out.path, turbulence, METHOD, run, resume=True)
     torch.testing.assert_close(result.field.parts[0](points), before)
