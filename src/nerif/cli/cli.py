@@ -48,9 +48,6 @@ def main(arguments: list[str] | None = None) -> int:
     """
     from nerif.common.interruption import handle_signals, received
 
-    # read when PyTorch is imported: threads that wait do not take the cores of other programs, for which the others
-    # would then wait at every operation
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     try:
         for stream in (sys.stdout, sys.stderr):
             if isinstance(stream, io.TextIOWrapper) and stream.encoding.lower() not in ("utf-8", "utf8"):
