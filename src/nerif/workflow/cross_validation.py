@@ -111,8 +111,8 @@ class CrossValidation:
         with self.monitor.counting(f"predicting {name}"):
             pair = with_rig(self.data.select([name, other]), result)
             splines = splines_for_views(result.field, pair, result.device, VALIDATION_VOXELS)
-            views = reproject(result.field, pair, [name], result.device, model=result.model, splines=splines)
-            scores = evaluate_views(views)
+            predicted = reproject(result.field, pair, [name], result.device, model=result.model, splines=splines)
+            scores = evaluate_views(predicted)
         views, fitted = ([v for v in scores if v["withheld"] is flag] for flag in (True, False))
         entries = {"views": views, "fitted_views": fitted, "seconds": time.monotonic() - start}
         with self._directory.writing(SCORES) as path:
