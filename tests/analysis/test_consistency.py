@@ -8,6 +8,7 @@ import pytest
 import torch
 from scipy.ndimage import gaussian_filter
 
+from nerif.analysis import image_edges
 from nerif.analysis.consistency import (
     Change,
     Correction,
@@ -167,6 +168,15 @@ def test_edges_that_cut_the_flow(phantom, views, pitch, sides):
     edges = cut_edges(m, m.observations[0])
     assert {edge.side for edge in edges} == sides
     assert {edge.view for edge in edges} == (set(range(views)) if sides else set())
+
+
+@pytest.mark.parametrize(("pitch", "sides"), [(0.02, {"left", "right"}), (0.1, set())])
+def test_edges_of_large_images_are_those_of_their_bins(pitch, sides, monkeypatch):
+    monkeypatch.setattr(image_edges, "PIXELS", 20)
+    m = square(phantom="flame", views=1, image_size=(41, 40), pixel_pitch=pitch, noise=0.02)
+    valid = torch.ones(m.shape, dtype=torch.bool)
+    valid[:, 20, 20] = False  # its bin has three pixels
+    assert {edge.side for edge in cut_edges(replace(m, valid=valid), m.observations[0])} == sides
 
 
 def test_a_shaken_camera_or_noise_cuts_nothing(small):

@@ -123,6 +123,15 @@ def test_the_error_stated_is_not_the_one_that_chooses(plume, monkeypatch):
     assert pixels[0] == pytest.approx(pixels[1], rel=0.1)
 
 
+def test_a_detail_without_time_is_not_tried(plume, monkeypatch):
+    truth, measurement = plume
+    coarse = Detail(smoothed(truth, 1.0), measurement.without(["0deg"]), SETTINGS, coarse=COARSE)
+    monkeypatch.setattr(Detail, "trial", None)
+    choice = choose(coarse, measurement.select(["0deg"]), most=0.0)
+    assert choice.seconds > 0
+    assert math.isnan(choice.after)
+
+
 def test_only_noise_is_not_significant():
     truth = smoothed(make_phantom("gaussians", BOX, 2), 3.0)
     assert Detail(truth, simulated(truth, pixels=24), SETTINGS).residual < SIGNIFICANT
