@@ -65,11 +65,10 @@ def whiteness(residual: Map, predicted: Map | None, mask: Mask) -> Whiteness | N
 
     @cache
     def patterns() -> dict[str, list[Map]]:
-        causes = {} if predicted is None else _patterns(predicted)
-        return {
-            cause: [_block_sums(np.where(mask[..., None] & np.isfinite(p), p, 0.0), FINE) for p in maps]
-            for cause, maps in causes.items()
-        }
+        if predicted is None:
+            return {}
+        causes = _patterns(_block_sums(predicted.astype(np.float64), FINE) / FINE**2)
+        return {cause: [np.where(np.isfinite(p), count * p, 0.0) for p in maps] for cause, maps in causes.items()}
 
     def coarser(sums: Map) -> Map:
         return _block_sums(sums, COARSE // FINE)
