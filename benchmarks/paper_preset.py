@@ -80,7 +80,8 @@ def measure(
     paper = replace(
         paper, network=network, points_per_batch=points, epochs=epochs, seed=seed, device="cpu", **CHANGES[change]
     )
-    start, curve, losses, first = time.process_time(), [], [], []
+    start, losses = time.process_time(), list[float]()
+    first, curve = list[float](), list[list[float]]()
 
     def record(step: Step) -> bool:
         losses.append(step.losses["loss"])
