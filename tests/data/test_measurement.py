@@ -62,6 +62,14 @@ def test_file_is_plain_netcdf_and_read_as_written(full, tmp_path):
     assert not list(tmp_path.glob("*.part"))
 
 
+def test_noise_is_stored_as_it_is_and_constant_maps_compressed(full, tmp_path):
+    sigma = torch.full_like(full.sigma, 0.1)
+    replace(full, sigma=sigma).write(tmp_path / "m.nc")
+    with xr.open_dataset(tmp_path / "m.nc") as dataset:
+        compressed = {name: dataset[name].encoding["zlib"] for name in ("displacement", "sigma")}
+    assert compressed == {"displacement": False, "sigma": True}
+
+
 def test_the_tilt_of_sensors_is_read_as_written(full, tmp_path):
     tilt = torch.tensor([[0.05, -0.02], [0.0, 0.0], [0.1, 0.03]], dtype=torch.float64)
     cameras = tuple(replace(c, tilt=t) for c, t in zip(full.cameras, tilt, strict=True))

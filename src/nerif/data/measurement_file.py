@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from jaxtyping import Shaped
 from torch import Tensor
 
 from nerif.common.conventions import COMPONENTS, DEFAULT_AMBIENT_FACES, InputError, parse_faces, whole, within
@@ -92,16 +93,24 @@ def map_names() -> tuple[str, ...]:
 
 
 def encoding(dataset: xr.Dataset) -> dict[str, dict[str, Any]]:
-    """Return the compression of the maps, in chunks within one view: views are read one by one."""
+    """Return the storage of the maps, in chunks within one view: views are read one by one.
+
+    Maps that vary from pixel to pixel are not compressed: noise takes fifty times as long for a seventh of its bytes.
+    """
     packing = {}
     for name, variable in dataset.data_vars.items():
         if variable.dims[:3] == PIXELS:
             _, rows, columns, *rest = variable.shape
             chunks = (1, min(rows, 256), min(columns, 256), *rest)
-            packing[str(name)] = {
-                "zlib": True, "complevel": 1, "shuffle": True, "chunksizes": chunks, "_FillValue": None,
-            }  # fmt: skip
+            compression = {"zlib": True, "complevel": 1, "shuffle": True} if _repeats(variable.values) else {}
+            packing[str(name)] = {**compression, "chunksizes": chunks, "_FillValue": None}
     return packing
+
+
+def _repeats(values: Shaped[np.ndarray, "view row column ..."]) -> bool:
+    """Whether most pixels have the value of their neighbour, by every 16th row."""
+    rows = values[:, ::16]
+    return rows.shape[2] > 1 and bool((rows[:, :, 1:] == rows[:, :, :-1]).mean() > 0.5)
 
 
 def to_dataset(measurement: MeasurementData) -> xr.Dataset:
