@@ -58,8 +58,9 @@ def fingerprint(
     constants: dict[str, list[Any]] = {}
     for o in measurement.observations:
         usable = measurement.usable_for(o)
-        maps[o.technique.measured] = digest([o.values[usable]])
-        maps[o.technique.sigma] = digest([None if o.sigma is None else o.sigma[usable]])
+        whole = bool(usable.all())  # then nothing is copied
+        for name, values in ((o.technique.measured, o.values), (o.technique.sigma, o.sigma)):
+            maps[name] = digest([None if values is None else values.flatten(0, 2) if whole else values[usable]])
         for name, value in forward_model(o.technique, measurement).constants.items():
             constants.setdefault(name, []).append(value)
     return {
@@ -110,7 +111,8 @@ def digest(parts: Iterable[Any]) -> str:
     result = hashlib.blake2b(digest_size=16)
     for part in parts:
         if isinstance(part, Tensor):
-            result.update(str(tuple(part.shape)).encode() + part.contiguous().numpy().tobytes())
+            result.update(str(tuple(part.shape)).encode())
+            result.update(part.contiguous().numpy().reshape(-1).view("uint8"))
         else:
             result.update(repr(part).encode())
         result.update(b"|")

@@ -24,7 +24,7 @@ from nerif.reconstruction.voxels.voxel_reconstructor import VoxelReconstructor
 
 __all__ = ["Budget"]
 
-REPORT, PER_PIXEL = 4.5, 2.5e-6  # s: files, verdict and report; scores and images of the views
+REPORT, PER_PIXEL = 4.5, 1.6e-6  # s: files, verdict and report; scores and images of the views
 LEAST = 0.1  # of the limit, for the fits
 PROBE = 16384  # points
 STEP = 7.5  # time of a training step per point, in evaluations: measured on a CPU, thin rays (6.9 to 8.1)
