@@ -112,7 +112,7 @@ def digest(parts: Iterable[Any]) -> str:
     for part in parts:
         if isinstance(part, Tensor):
             result.update(str(tuple(part.shape)).encode())
-            result.update(part.contiguous().numpy().reshape(-1).view("uint8"))
+            result.update(part.contiguous().numpy().reshape(-1).view("uint8").data)
         else:
             result.update(repr(part).encode())
         result.update(b"|")
