@@ -52,16 +52,8 @@ def cases(quick: bool) -> Iterator[Settings]:
         yield {"phantom": phantom, **small, "change": "none", "seed": seed}
     if quick:
         return
-    yield {
-        "phantom": "gaussians",
-        **small,
-        "pixels": 24,
-        "depth": 7,
-        "width": 256,
-        "hours": 2.0,
-        "change": "none",
-        "seed": 0,
-    }
+    large = {"pixels": 24, "depth": 7, "width": 256, "hours": 2.0}
+    yield {"phantom": "gaussians", **small, **large, "change": "none", "seed": 0}
     for change in CHANGES:
         yield {"phantom": "gaussians", **small, "epochs": 20.0, "change": change, "seed": 0}
 

@@ -109,3 +109,8 @@ def test_white_noise_is_the_pixel_to_pixel_noise():
     assert white_noise(misfit, mask) < 0.02 * SIGMA / 0.05
     assert white_noise(gaussian_filter(noise, (1, 1, 0)), mask) < 0.2 * SIGMA
     assert white_noise(noise[:1], mask[:1]) is None
+
+
+def test_images_of_two_rows_are_too_few_for_the_test():
+    residual = np.ones((2, 48, 2))
+    assert whiteness(residual, residual, np.ones((2, 48), dtype=bool)) is None

@@ -73,11 +73,11 @@ def whiteness(residual: Map, predicted: Map | None, mask: Mask) -> Whiteness | N
     def coarser(sums: Map) -> Map:
         return _block_sums(sums, COARSE // FINE)
 
-    fine = _tested(sums, count, square, FINE, patterns)
     coarse = _tested(
         coarser(sums), coarser(count), square, COARSE,
         lambda: {cause: [*map(coarser, maps)] for cause, maps in patterns().items()},
     )  # fmt: skip
+    fine = None if coarse is None else _tested(sums, count, square, FINE, patterns)
     if coarse is None or fine is None:
         return None
     cause, share = _largest(fine.shares)
