@@ -134,7 +134,7 @@ class _Penalty:
         blocks[..., 1:, 1:] = second * 0.5 * d.conj()[..., :, None] * d[..., None, :]
         for a in range(3):
             blocks[..., a + 1, a + 1] = first + second * 0.5 * (square.sum(dim=-1) + square[..., a])
-        return torch.linalg.inv(blocks).to(torch.complex64)
+        return torch.linalg.inv(blocks).to(self.problem.operator.dtype.to_complex())
 
     def _difference(self, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """grad x - w at the faces."""
