@@ -17,11 +17,11 @@ from torch import Tensor
 from nerif.common.conventions import InputError
 from nerif.data.kinds import VELOCITY, VELOCITY_KIND, kind_of
 from nerif.data.quantity_names import FLOW_QUANTITIES
-from nerif.data.volume import COMPONENTS, Volume, export
+from nerif.data.volume import COMPONENTS, Volume
 from nerif.data.volume_sequence import VolumeSequence
 from nerif.geometry import Grid
 
-__all__ = ["STANDARD_NAMES", "VelocitySequence", "export_frame", "open_volumes"]
+__all__ = ["STANDARD_NAMES", "VelocitySequence", "open_volumes"]
 
 DERIVED = ("speed", "vorticity")
 STANDARD_NAMES = {"u": "eastward_wind", "v": "northward_wind", "w": "upward_air_velocity"}
@@ -85,19 +85,3 @@ def curl(vectors: Float[Tensor, "3 z y x"], grid: Grid) -> Float[Tensor, "3 z y 
 def open_volumes(path: str | os.PathLike[str]) -> VolumeSequence:
     """Open volumes over time, or velocities, whose quantities include speed and vorticity."""
     return VelocitySequence(path) if kind_of(path) is VELOCITY else VolumeSequence(path)
-
-
-def export_frame(
-    path: str | os.PathLike[str], store: str | os.PathLike[str], frame: int | None, quantities: Sequence[str] = (),
-    force: bool = False,
-) -> int:  # fmt: skip
-    """Write quantities (default: all) of one frame of volumes over time, and return their number.
-
-    A .vti holds velocity as vectors.
-    """
-    volumes = open_volumes(store)
-    wanted = quantities or volumes.quantities
-    if frame is None or not 0 <= frame < len(volumes):
-        raise InputError(f"expected 0 to {len(volumes) - 1}, got {'none' if frame is None else frame}", field="frame")
-    export(path, [volumes.volume(frame, name) for name in wanted], force)
-    return len(wanted)

@@ -1,4 +1,4 @@
-"""A volume: values at voxel centres; and its formats: VTK (.vti, for ParaView), NetCDF, NumPy, MATLAB, text (.csv)."""
+"""A volume: values at voxel centres; and its formats: VTK (.vti for ParaView), NetCDF, NumPy, MATLAB, text, Tecplot."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "COMPONENTS", "FORMATS", "REFERENCES", "Volume", "export", "to_dataset", "write_csv", "write_mat", "write_netcdf",
-    "write_npz",
+    "write_npz", "write_tecplot",
 ]  # fmt: skip
 
 COMPONENTS = ("u", "v", "w")
@@ -99,7 +99,7 @@ class Volume:
         return dataset[self.quantity].assign_attrs(dataset.attrs)
 
     def write(self, path: str | os.PathLike[str], force: bool = False) -> None:
-        """Write a file in the format of its ending (.vti, .nc, .npz, .mat, .csv); over another with `force`."""
+        """Write a file in the format of its ending (.vti, .nc, .npz, .mat, .csv, .dat); over another with `force`."""
         export(path, [self], force)
 
     def plot(self) -> Figure:
@@ -256,4 +256,39 @@ def write_csv(path: str | os.PathLike[str], volumes: list[Volume]) -> None:
         np.savetxt(part, torch.cat(columns, dim=1).numpy(), delimiter=",", header=header, comments="", fmt="%.9g")
 
 
-FORMATS = {".vti": _write_vti, ".nc": write_netcdf, ".npz": write_npz, ".mat": write_mat, ".csv": write_csv}
+def write_tecplot(path: str | os.PathLike[str], volumes: list[Volume], time: float | None = None) -> None:
+    """Write Tecplot text: an ordered zone, x fastest, with X, Y, Z in mm and the quantities, 0 where they are NaN.
+
+    There QUANTITY_valid is 0, elsewhere 1. A quantity without NaN has none, except at an instant `time` (s) of a film,
+    whose files all have the same variables.
+
+    Source: vtkTecplotReader of VTK, which ParaView uses. It takes the coordinates by these names, and stops at NaN.
+    """
+    grid = volumes[0].grid
+    columns, names, formats = [grid.points(torch.float64).reshape(-1, 3)], ["X", "Y", "Z"], ["%.9g"] * 3
+    for v in volumes:
+        valid = torch.isfinite(v.values.cpu()).reshape(-1, 1)
+        columns.append(v.values.cpu().double().reshape(-1, 1).where(valid, 0.0))
+        names.append(v.quantity)
+        formats.append("%.12g" if v.values.dtype == torch.float64 else "%.9g")
+        if time is not None or not bool(valid.all()):
+            columns.append(valid.double())
+            names.append(f"{v.quantity}_valid")
+            formats.append("%d")
+    nz, ny, nx = grid.shape
+    name, instant = ("volume", "") if time is None else (f"t = {time!r} s", f", STRANDID=1, SOLUTIONTIME={time!r}")
+    header = [
+        "# X, Y, Z in mm; " + "; ".join(f"{v.quantity} in {v.unit}" for v in volumes),
+        'TITLE = "nerif"',
+        "VARIABLES = " + ", ".join(f'"{name}"' for name in names),
+        f'ZONE T="{name}", I={nx}, J={ny}, K={nz}, DATAPACKING=POINT{instant}',
+    ]
+    with atomic(path) as part:
+        rows = torch.cat(columns, dim=1).numpy()
+        np.savetxt(part, rows, header="\n".join(header), comments="", fmt=formats, encoding="utf-8")
+
+
+FORMATS = {
+    ".vti": _write_vti, ".nc": write_netcdf, ".npz": write_npz, ".mat": write_mat, ".csv": write_csv,
+    ".dat": write_tecplot,
+}  # fmt: skip

@@ -9,13 +9,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from nerif.common.conventions import InputError, ambient_index
-from nerif.common.files import atomic, reading
+from nerif.common.files import atomic, ending, reading
 from nerif.common.memory import check_memory
 from nerif.common.times import check_interval, interval, seconds
+from nerif.data.folder_export import Exported, OnFile, write_frames, write_planes
 from nerif.data.kinds import SEQUENCE_RESULT, TRUE_SEQUENCE, Kind, check_kind, reading_as
 from nerif.data.measurement_sequence import ZARR_FORMAT, add_frames, check_instants, check_store, require_store
 from nerif.data.quantity_names import describe, field_of, name_of
-from nerif.data.volume import REFERENCES, Volume
+from nerif.data.volume import REFERENCES, Volume, export
 from nerif.forward.forward_model import ForwardModel
 from nerif.forward.registry import ASSUMED, technique
 from nerif.geometry import Box, Grid
@@ -172,3 +173,47 @@ class VolumeSequence:
             raise InputError(f"expected one of {', '.join(self.quantities)}, got '{quantity}'", field=self.path)
         values = torch.from_numpy(self.read(quantity, index))
         return Volume.of(values, self.grid, quantity, self.n_ambient)
+
+    @property
+    def complete(self) -> list[int]:
+        """Numbers of the complete frames: all of a store without status, else those that are done."""
+        import numpy as np
+
+        if "status" not in self.group:
+            return list(range(len(self)))
+        return [int(i) for i in np.flatnonzero(self.read("status", slice(None)) == 1)]
+
+    def export(
+        self, path: str | os.PathLike[str], quantities: Sequence[str] = (), frame: int | None = None,
+        force: bool = False, on_file: OnFile = lambda done, total: None,
+    ) -> Exported:  # fmt: skip
+        """Write one frame, or all complete ones, for other programs.
+
+        Parameters
+        ----------
+        path : NAME.pvd (ParaView) or NAME.dat (Tecplot) for all frames, each a file in the folder NAME; for one frame a
+            format of volumes, or NAME.txt (DaVis), u and v on planes z = constant, each a file in the folder NAME
+        quantities : to write; default: all
+        frame : number of the frame
+        force : replace an earlier export
+        on_file : called with the numbers of written files and of all
+        """
+        path, names, complete = Path(path), tuple(quantities or self.quantities), self.complete
+        if frame is None and ending(path) in (".pvd", ".dat"):
+            if not complete:
+                raise InputError("expected at least one finished frame, got none", field=self.path)
+            times = {i: self.times[i] for i in complete}
+            place = write_frames(path, times, lambda i: [self.volume(i, name) for name in names], force, on_file)
+            summary = f"{len(names)} quantities of {len(complete)} frames"
+            return Exported(place, summary, len(self) - len(complete))
+        if frame is None or frame not in complete:
+            text = f"a complete frame, 0 to {len(self) - 1}, or all with NAME.pvd or NAME.dat"
+            raise InputError(f"expected {text}, got {'none' if frame is None else frame}", field="frame")
+        if ending(path) != ".txt":
+            export(path, [self.volume(frame, name) for name in names], force)
+            return Exported(path, f"{len(names)} quantities of frame {frame}")
+        if not {"u", "v"} <= {*self.quantities} or not {*quantities} <= {"u", "v"}:
+            raise InputError("expected u and v of velocities for .txt; for others give NAME.dat", field="quantities")
+        place = write_planes(path, self.volume(frame, "u"), self.volume(frame, "v"), force, on_file)
+        z = self.grid.axis("z")
+        return Exported(place, f"u and v of frame {frame} on {len(z)} planes, z = {z[0]:g} to {z[-1]:g} mm")

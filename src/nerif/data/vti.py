@@ -1,10 +1,11 @@
-"""VTK XML files, what ParaView opens: images (.vti) of volumes, and polygons (.vtp) of surfaces."""
+"""VTK XML files, what ParaView opens: images (.vti) of volumes, polygons (.vtp) of surfaces, films of them (.pvd)."""
 
 from __future__ import annotations
 
 import base64
 import os
 import zlib
+from collections.abc import Mapping
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -17,7 +18,7 @@ from nerif.common.files import atomic, reading
 from nerif.common.memory import check_memory
 from nerif.geometry import Box, Grid
 
-__all__ = ["read_vti", "write_vti", "write_vtp"]
+__all__ = ["read_vti", "write_pvd", "write_vti", "write_vtp"]
 
 BLOCK_BYTES = 1 << 20
 BYTES_OF_WORD = 32  # of a short word of a text once it is split, for each of its characters
@@ -65,6 +66,24 @@ def write_vtp(
     document.add(polygons, "DataArray", "Int64", "connectivity", _bytes(faces, "<i8"))
     document.add(polygons, "DataArray", "Int64", "offsets", np.arange(3, 3 * len(faces) + 1, 3).astype("<i8").tobytes())
     document.write(path)
+
+
+def write_pvd(path: str | os.PathLike[str], times: Mapping[str, float]) -> None:
+    """Write a list of VTK files and their times in s, atomically.
+
+    Source: ParaView's wiki, Data formats, PVD file format.
+
+    Parameters
+    ----------
+    times : s, by file, relative to the folder of the list, with forward slashes
+    """
+    root = ElementTree.Element("VTKFile", type="Collection", version="0.1", byte_order="LittleEndian")
+    collection = ElementTree.SubElement(root, "Collection")
+    for file, time in times.items():
+        ElementTree.SubElement(collection, "DataSet", timestep=repr(time), group="", part="0", file=file)
+    ElementTree.indent(root)
+    with atomic(path) as part:
+        part.write_bytes(ElementTree.tostring(root, encoding="utf-8", xml_declaration=True))
 
 
 def _bytes(values: Tensor, kind: str) -> bytes:

@@ -1,4 +1,4 @@
-"""nerif export: a reconstruction on any grid, or the geometry of a measurement, for other programs."""
+"""nerif export: a reconstruction on any grid, a film, or the geometry of a measurement, for other programs."""
 
 from __future__ import annotations
 
@@ -23,22 +23,24 @@ __all__ = ["Export", "main", "run"]
 
 @dataclass(frozen=True)
 class Export(Settings):
-    """Write a reconstruction as .vti (ParaView), .nc, .npz, .mat or .csv, on any grid.
+    """Write a reconstruction as .vti (ParaView), .nc, .npz, .mat, .csv or .dat (Tecplot), on any grid.
 
+    Volumes over time become NAME.pvd (ParaView) or NAME.dat, with a file per frame in the folder NAME.
     With --format astra or tigre, write cameras and grid of a measurement as the geometry of that program.
     """
 
     result: Annotated[Path, Positional]
     """Result directory of nerif reconstruct, or volumes over time (.zarr); for astra and tigre a measurement (.nc)."""
     out: Path
-    """Output file; format by its ending: .vti, .nc, .npz, .mat or .csv; for astra and tigre .npz."""
+    """Output file; format by its ending: .vti, .nc, .npz, .mat, .csv or .dat; .pvd or .dat for all frames of volumes
+    over time; .txt (DaVis) for u and v of a frame, a file per plane of z; for astra and tigre .npz."""
     format: Literal["field", "astra", "tigre"] = "field"
     """What to write: the field, or cameras and grid for astra or tigre."""
     quantities: tuple[str, ...] = ()
     """Quantities to write; of an index index_excess (1), n (1), density (kg/m3), temperature (K) (default: all but
     temperature)."""
     frame: int | None = None
-    """Frame of volumes over time, counted from 0, on their own voxels."""
+    """Frame of volumes over time, counted from 0, on their own voxels (default: all, with .pvd or .dat)."""
     voxels: int = 100
     """Voxels along the longest edge."""
     shape: tuple[int, int, int] | None = None
@@ -48,20 +50,23 @@ class Export(Settings):
     upper: tuple[float, float, float] | None = None
     """Upper corner x y z of the region, mm."""
     force: bool = False
-    """Overwrite an existing file."""
+    """Overwrite an existing file, or folder of frames or planes."""
     gas: GasChanges = field(default_factory=GasChanges)
     """Gas for density and temperature."""
 
 
 def run(settings: Export) -> None:
     """Write the file."""
+    from nerif.data.folder_export import FOLDER_FORMATS
     from nerif.data.geometry_export import export_geometry
     from nerif.data.measurement import Measurement
-    from nerif.data.velocity_sequence import export_frame
+    from nerif.data.velocity_sequence import open_volumes
     from nerif.data.volume import FORMATS, export
     from nerif.results.directory import ResultDirectory
 
-    check_output(settings.out, settings.force, endings=tuple(FORMATS) if settings.format == "field" else (".npz",))
+    over_time = ending(settings.result) == ".zarr"
+    endings = (*FORMATS, *(FOLDER_FORMATS if over_time else ()))
+    check_output(settings.out, settings.force, endings=endings if settings.format == "field" else (".npz",))
     if settings.format != "field":
         if settings.quantities:
             raise InputError(f"expected none with --format {settings.format}, which has no field", field="quantities")
@@ -70,9 +75,13 @@ def run(settings: Export) -> None:
         export_geometry(settings.out, measurement, grid, settings.format, lambda line: say(f"note: {line}"))
         say(f"{settings.out}: {len(measurement.cameras)} views and {' x '.join(map(str, grid.shape))} voxels (z, y, x)")
         return
-    if ending(settings.result) == ".zarr":
-        count = export_frame(settings.out, settings.result, settings.frame, settings.quantities, settings.force)
-        say(f"{settings.out}: {count} quantities of frame {settings.frame}")
+    if over_time:
+        store = open_volumes(settings.result)
+        with counting_bar("writing files") as bar:
+            done = store.export(settings.out, settings.quantities, settings.frame, settings.force, bar)
+        say(f"{done.path}: {done.summary}")
+        if done.left_out:
+            say(f"{done.left_out} missing or failed frames were left out")
         return
     if settings.frame is not None:
         raise InputError("expected volumes over time (.zarr) with --frame", field="frame")
