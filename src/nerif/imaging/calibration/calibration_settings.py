@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
-from annotated_types import Ge, Lt
+from annotated_types import Ge, Le, Lt
 from jaxtyping import Float
 
 from nerif.common.conventions import FACES, InputError
@@ -177,6 +177,12 @@ class ImportSettings:
     target images, and for --simple, where the origin is on the axis of the flow."""
     image_size: tuple[int, int] | None = None
     """Height and width of the images where the file lacks them, px."""
+    first_pixel: Annotated[float, Ge(0), Le(1)] | None = None
+    """Coordinate of the centre of the first pixel in a .csv of DLT coefficients, which need it, or of points (default:
+    0): 1 in files of MATLAB (DLTdv, easyWand), 0.5 where the image begins at 0."""
+    rows_upward: bool = False
+    """In such a .csv, rows count from the lower edge of the image, as in Argus and before version 8 in DLTdv; needs the
+    image size."""
     aperture_diameter: float | None = None
     """Diameter of the entrance pupils (focal length / f-number), mm; overrides the file; 0: thin rays. Of telecentric
     lenses: of the cone of rays at z_cam = 0, which calibration places at the origin. Also for target images."""

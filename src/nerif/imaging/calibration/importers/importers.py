@@ -16,7 +16,7 @@ import torch
 from nerif.common.conventions import InputError
 from nerif.common.files import check_file, check_known, ending
 from nerif.data.cameras_file import CalibratedCamera, check_camera, check_names, read_box
-from nerif.data.kinds import ARRAYS, CALIBRATION, IMAGES, reading_as
+from nerif.data.kinds import ARRAYS, CALIBRATION, IMAGES, VECTORS, reading_as
 from nerif.geometry import Box, Lens, Plane
 from nerif.geometry.distortion import POWERS
 from nerif.imaging.calibration.calibration_settings import ImportSettings
@@ -25,7 +25,7 @@ from nerif.imaging.calibration.importers.geometry_files import read_geometry
 from nerif.imaging.calibration.importers.matlab import read_matlab
 from nerif.imaging.calibration.importers.nerfstudio import read_transforms
 from nerif.imaging.calibration.importers.openptv import ORI, read_openptv
-from nerif.imaging.calibration.importers.tables import read_csv, read_tables
+from nerif.imaging.calibration.importers.tables import holds_points, read_csv, read_tables
 from nerif.imaging.calibration.importers.yaml_files import ENDINGS as YAML
 from nerif.imaging.calibration.importers.yaml_files import read_yaml_files
 from nerif.imaging.readers.views import VIEWS
@@ -33,8 +33,8 @@ from nerif.imaging.readers.views import VIEWS
 __all__ = ["import_box", "import_cameras", "is_calibration"]
 
 STANDARD = ImportSettings()
-READERS = {".toml": read_tables, ".csv": read_csv, ".json": read_transforms}
-ENDINGS = (*READERS, *YAML, ".mat", ".npz", ORI)
+READERS = {".toml": read_tables, ".json": read_transforms}
+ENDINGS = (".toml", ".csv", ".json", *YAML, ".mat", ".npz", ORI)
 
 
 def is_calibration(path: Path) -> bool:
@@ -56,12 +56,15 @@ def import_cameras(
 
     Parameters
     ----------
-    path : .toml, .csv, .yml, .yaml, .xml (OpenCV, ROS, kalibr), .json (NeRF), .mat (MATLAB), .npz (ASTRA, TIGRE),
-        .ori (OpenPTV), cameras.txt (COLMAP)
+    path : .toml; .csv (a row a camera, points of the world and the image, DLT coefficients); .yml, .yaml, .xml
+        (OpenCV, ROS, kalibr, DaVis); .json (NeRF); .mat (MATLAB); .npz (ASTRA, TIGRE); .ori (OpenPTV); cameras.txt
+        (COLMAP)
     only : names of the cameras to read; all if empty
+    say : receives files read together, residuals of fitted cameras, and notes
     """
     path = Path(path)
-    with reading_as(path, CALIBRATION, ignore=(ARRAYS, IMAGES)):
+    like = (ARRAYS, IMAGES, VECTORS) if holds_points(path) else (ARRAYS, IMAGES)  # kinds with the same endings or heads
+    with reading_as(path, CALIBRATION, ignore=like):
         cameras, unit = _read(path, settings, say)
     if not cameras:
         raise InputError("holds no camera", field=path)
@@ -85,6 +88,8 @@ def _read(path: Path, settings: ImportSettings, say: Callable[[str], None]) -> t
         return read_openptv(path), 1.0
     if path.is_dir() or ending(path) in YAML:
         return read_yaml_files(path, say)
+    if ending(path) == ".csv":
+        return read_csv(path, settings, say)
     readers = {".mat": lambda p: read_matlab(p, settings.pose), ".npz": lambda p: read_geometry(p, say), **READERS}
     if ending(path) in readers:
         return readers[ending(path)](path), 1.0

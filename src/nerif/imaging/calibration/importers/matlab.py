@@ -31,9 +31,11 @@ from nerif.common.memory import check_memory
 from nerif.data.cameras_file import CalibratedCamera, check_distortion, check_model, flat, numbers
 from nerif.imaging.calibration.importers.names import UNNAMED
 
-__all__ = ["read_matlab"]
+__all__ = ["WORLD_UNITS", "read_matlab"]
 
 EXPORT = "in MATLAB run  s = toStruct(params); save('plain.mat', '-struct', 's')  and give plain.mat"
+PIVLAB = ("cam_K_opencv", "cam_selected_target_images", "cam_use_tilted_model")
+"""Plain arrays beside the object cameraParams in camera_calibration.mat of PIVlab, without a pose."""
 TOOLBOX = ("IntrinsicMatrix", "RadialDistortion", "RotationVectors", "RotationMatrices")
 """Fields that distinguish a struct of the toolbox from plain arrays."""
 DISTORTION = ("distortion", "dist", "dist_coeffs", "distCoeffs", "kc", "D")
@@ -64,8 +66,11 @@ def read_matlab(path: Path, pose: int = 1) -> list[CalibratedCamera]:
     cameras = _cameras(content, path.stem, path, pose)
     if cameras:
         return cameras
-    if objects:
-        raise InputError(f"holds a MATLAB object '{objects[0]}', which only MATLAB can read; {EXPORT}", field=path)
+    pivlab = any(name in content for name in PIVLAB)
+    if pivlab or objects:
+        program, name = ("PIVlab's", "cameraParams") if pivlab else ("a MATLAB", objects[0])
+        export = EXPORT.replace("params", name)
+        raise InputError(f"holds {program} object '{name}', which only MATLAB can read; {export}", field=path)
     raise InputError(
         f"expected fc, cc, kc (Bouguet's toolbox), K or IntrinsicMatrix with RotationVectors "
         f"(cameraParameters by toStruct), or K, R, t, got {', '.join(content) or 'nothing'}",

@@ -1,23 +1,24 @@
-"""Cameras of a plain table: TOML with one table per camera, CSV with one row per camera."""
+"""Cameras of a plain table: TOML with one table per camera, CSV with one row per camera or in another form."""
 
 from __future__ import annotations
 
-import codecs
-import csv
 import math
-import re
-from collections import Counter
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from nerif.common.conventions import InputError
-from nerif.common.files import check_known, read_toml
+from nerif.common.files import check_known, ending, read_toml
 from nerif.data.cameras_file import FORMAT, CalibratedCamera, check_model, numbers, read_cameras
 from nerif.geometry import PERSPECTIVE
+from nerif.imaging.calibration.calibration_settings import ImportSettings
+from nerif.imaging.calibration.importers.dlt import are_numbers, is_dlt, read_dlt
 from nerif.imaging.calibration.importers.names import UNNAMED
+from nerif.imaging.calibration.importers.point_lists import is_point_list, read_point_list
+from nerif.imaging.calibration.importers.sheet import read_sheet
 
-__all__ = ["read_csv", "read_tables"]
+__all__ = ["holds_points", "read_csv", "read_tables"]
 
 KEYS = ("K", "R", "t", "distortion", "image_size", "normal", "offset", "projection", "tilt")
 REQUIRED = ("fx", "fy", "cx", "cy", *(f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)), "tx", "ty", "tz")
@@ -70,73 +71,53 @@ def _anipose(path: Path, key: str, table: Any) -> CalibratedCamera:
     )  # fmt: skip
 
 
-def read_csv(path: Path) -> list[CalibratedCamera]:
-    """Read one camera per row, from the columns COLUMNS, separated by tabs, semicolons or commas.
+def read_csv(
+    path: Path, settings: ImportSettings, say: Callable[[str], None]
+) -> tuple[list[CalibratedCamera], float]:  # fmt: skip
+    """Read cameras and their unit of length in mm, from a row each, from points, or from DLT coefficients.
 
-    Names of columns may have capital letters. Numbers have a decimal point, or all of them a decimal comma.
+    Cells are separated by tabs, semicolons or commas. Names of columns may have capital letters. Numbers have a decimal
+    point, or all of them a decimal comma.
     """
-    lines = [line for line in _text(path).splitlines() if line.strip() and not line.lstrip().startswith("#")]
-    if lines and (match := re.fullmatch(r"sep=(.)\s*", lines[0], re.IGNORECASE)):  # Excel's own first line
-        lines = lines[1:]
-    if len(lines) < 2:
-        raise InputError(f"expected a line of column names and one line a camera, got {len(lines)} lines", field=path)
-    separator = match[1] if match else next((c for c in "\t;" if c in lines[0]), ",")
-    head, *rows = (
-        [cell.strip() for cell in row] for row in csv.reader(lines, delimiter=separator, skipinitialspace=True)
-    )
-    columns = [name.lower() for name in head]
+    sheet = read_sheet(path)
+    if is_point_list(sheet):
+        return read_point_list(sheet, settings, say)
+    columns = [name.lower() for name in sheet.rows[0]] if sheet.rows else []
+    if sheet.rows and (are_numbers(columns) or (is_dlt(sheet) and not {*COLUMNS} & {*columns})):
+        return read_dlt(sheet, settings), 1.0
+    if len(sheet.rows) < 2:
+        raise InputError(
+            f"expected a line of column names and one line a camera, got {len(sheet.rows)} lines", field=path
+        )
     check_known(filter(None, columns), COLUMNS, str(path), "column")
     for column in REQUIRED:
         if column not in columns:
             raise InputError(f"column '{column}' is missing", field=path)
-    if twice := [name for name, count in Counter(filter(None, columns)).items() if count > 1]:
-        raise InputError(f"expected each column once, got '{twice[0]}' twice", field=path)
-    tables: list[dict[str, str]] = []
-    for number, row in enumerate(rows, start=2):
-        if any(row[len(columns) :]):
-            raise InputError(
-                f"line {number}: expected {len(columns)} columns, got {len(row)}; separate them by semicolons if the "
-                "numbers have decimal commas",
-                field=path,
-            )
-        tables.append({name: cell for name, cell in zip(columns, row, strict=False) if cell})
-    number_cells = [cell for table in tables for name, cell in table.items() if name not in TEXTS]
-    commas = any("," in cell for cell in number_cells)
-    if commas and (separator == "," or any("." in cell for cell in number_cells)):
-        raise InputError(
-            "expected numbers with decimal points, such as 1500.5, or with decimal commas in a table separated by "
-            "semicolons or tabs, got commas and points, or commas in quotes; remove separators of thousands",
-            field=path,
-        )
-    if commas:
-        tables = [{k: v if k in TEXTS else v.replace(",", ".") for k, v in table.items()} for table in tables]
-    return [_row(cells, i, path) for i, cells in enumerate(filter(None, tables), start=1)]
+    tables = sheet.table(columns, {*COLUMNS} - {*TEXTS})
+    return [_row(cells, i, f"{path}: line {line}") for i, (line, cells) in enumerate(tables, 1)], 1.0
 
 
-def _text(path: Path) -> str:
-    """Return the text of a file in UTF-8, in UTF-16 with its mark (Excel's Unicode text) or in Windows-1252."""
-    content = path.read_bytes()
-    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-        encodings = ["utf-16"]
-    else:
-        encodings = [] if b"\0" in content else ["utf-8-sig", "cp1252"]
-    for encoding in encodings:
-        with suppress(UnicodeDecodeError):
-            return content.decode(encoding)
-    raise InputError("not a text file in UTF-8 or UTF-16", field=path)
+def holds_points(path: Path) -> bool:
+    """Return whether a file holds points of cameras or DLT coefficients, which resemble vectors."""
+    if ending(path) != ".csv" or not path.is_file():
+        return False
+    with suppress(InputError):
+        sheet = read_sheet(path)
+        return is_point_list(sheet) or is_dlt(sheet)
+    return False
 
 
-def _row(cells: dict[str, str], number: int, path: Path) -> CalibratedCamera:
+def _row(cells: dict[str, str], number: int, where: str) -> CalibratedCamera:
     x: dict[str, float] = dict.fromkeys(("s", *DISTORTION, *TILT), 0.0)
     for key in (*REQUIRED, *(cells.keys() - {*REQUIRED, *TEXTS})):
         try:
             x[key] = float(cells.get(key, ""))
         except ValueError:
             text = cells.get(key, "")
-            raise InputError(f"line {number + 1}: '{key}': expected a number, got '{text}'", field=path) from None
+            raise InputError(f"expected a number, got '{text}'", field=f"{where}: '{key}'") from None
     normal, size = ([x.get(k, math.nan) for k in keys] for keys in (("nx", "ny", "nz"), ("height", "width")))
     return CalibratedCamera.from_values(
-        f"{path}: line {number + 1}",
+        where,
         cells.get("name", f"{UNNAMED}{number}"),
         [[x["fx"], x["s"], x["cx"]], [0, x["fy"], x["cy"]], [0, 0, 1]],
         [[x[f"r{i}{j}"] for j in (1, 2, 3)] for i in (1, 2, 3)],

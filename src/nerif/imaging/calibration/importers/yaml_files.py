@@ -1,4 +1,4 @@
-"""Calibrations in YAML or XML, one file or a folder of them: of OpenCV, ROS or kalibr, distinguished by content."""
+"""Calibrations in YAML or XML, one file or a folder: of OpenCV, ROS, kalibr or DaVis, distinguished by content."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Any
 from nerif.common.conventions import InputError
 from nerif.common.files import ending, read_yaml
 from nerif.data.cameras_file import CalibratedCamera
+from nerif.imaging.calibration.importers.davis import davis_root, read_davis
 from nerif.imaging.calibration.importers.kalibr import is_kalibr, read_kalibr
 from nerif.imaging.calibration.importers.opencv import read_opencv, read_storage
 from nerif.imaging.calibration.importers.ros import is_ros, read_ros
@@ -17,7 +18,10 @@ from nerif.imaging.calibration.importers.ros import is_ros, read_ros
 __all__ = ["ENDINGS", "read_yaml_files"]
 
 ENDINGS = (".yml", ".yaml", ".xml")
-PROGRAMS = {"ROS": (read_ros, 1000.0), "kalibr": (read_kalibr, 1000.0), "OpenCV": (read_opencv, 1.0)}
+PROGRAMS = {
+    "ROS": (read_ros, 1000.0), "kalibr": (read_kalibr, 1000.0), "OpenCV": (read_opencv, 1.0),
+    "DaVis": (read_davis, 1.0),
+}  # fmt: skip
 """Reader of each program, and the unit of its lengths in mm: ROS and kalibr define metres, OpenCV none."""
 
 
@@ -54,6 +58,8 @@ def _files(folder: Path) -> list[Path]:
 
 def _content(file: Path) -> tuple[str, dict[str, Any]]:
     """Return program and entries of a file."""
+    if ending(file) == ".xml" and (root := davis_root(file)) is not None:
+        return "DaVis", {"root": root}
     values = {} if ending(file) == ".xml" else _plain_yaml(file)
     if is_kalibr(values):
         return "kalibr", values
