@@ -178,7 +178,7 @@ def test_vectors_of_other_programs_are_named_and_where_to_go(folder, tmp_path, m
         xr.Dataset({key: (("row", "column"), value) for key, value in maps.items()}).to_netcdf(name, engine="h5netcdf")
     else:
         Path(name).write_text(content)
-    got = f"got vectors of {program or 'another program'}; compute displacements from its images: nerif displacement "
+    got = f"got vectors of {program or 'another program'}; put them into FOLDER/VIEW, and read them: nerif vectors "
     for command in ("info {}", "calibrate {}"):
         assert got in refusal(*command.format(name).split())
     for other in ("name,fx,fy\na,1,1\n", "rx,ry,rz,tx,ty,tz\n1,2,3,4,5,6\n", "cores: 4\n", "a few words, x and y\n"):

@@ -24,8 +24,8 @@ from nerif.forward.registry import TECHNIQUES
 
 __all__ = [
     "ARRAYS", "BOST", "CALIBRATION", "EXPERIMENT", "FIELD", "IMAGES", "MEASUREMENT", "RESULT", "RUN", "SEQUENCE",
-    "SEQUENCE_KIND", "SEQUENCE_RESULT", "TRUE_SEQUENCE", "VELOCITY", "VELOCITY_KIND", "VOLUME", "Kind", "check_kind",
-    "kind_of", "known_conventions", "reading_as",
+    "SEQUENCE_KIND", "SEQUENCE_RESULT", "TRUE_SEQUENCE", "VELOCITY", "VELOCITY_KIND", "VOLUME", "Kind", "are_vectors",
+    "check_kind", "kind_of", "known_conventions", "reading_as",
 ]  # fmt: skip
 
 BOST = ("BOST-1.0", "BOST-1.1", "BOST-1.2")
@@ -39,6 +39,11 @@ VELOCITY_KIND = "nerif velocity 1"
 CALIBRATION_MARK = b"nerif-calibration"
 MAX_HEAD = 4096  # bytes of a text in which its mark is searched
 ARRAY_SUFFIXES = (*NUMPY_AND_HDF5, ".mat")  # HDF5 may also be NetCDF-4
+
+
+def are_vectors(kind: Kind | None) -> bool:
+    """Return whether a kind is that of vectors, of whatever program."""
+    return kind is not None and kind.use == VECTORS.use
 
 
 def known_conventions(conventions: object) -> bool:
@@ -93,8 +98,7 @@ ZIPPED_CONTENT = Kind("a zipped store", "unpack it: python -m zipfile -e {path} 
 CALIBRATION = Kind("a calibration", "nerif displacement FOLDER --calibration {path} -o m.nc uses it")
 VECTORS = Kind(
     "vectors of another program",
-    f"compute displacements from its images: {DISPLACEMENT.format('FOLDER')}; or give u and v in px to "
-    "nerif.Measurement in Python",
+    "put them into FOLDER/VIEW, and read them: nerif vectors FOLDER --calibration calibration.toml -o m.nc",
 )
 PROGRAMS = {
     "PIVlab": rb"^PIVlab ", "DaVis": rb"^#\w+ [\d.]+ [23]D-vector|^TITLE *= *\"B\d{5}|\"isValid\"",
@@ -154,8 +158,9 @@ def _of_folder(path: Path) -> Kind | None:
         return VIEW
     if any(name.endswith(FOLDER_SUFFIXES) for name in names):
         return IMAGES
-    files = sorted(entry for entry in path.iterdir() if entry.is_file())
-    return _vectors(files[0]) if files else None
+    folders = [path, *sorted(entry for entry in path.iterdir() if entry.is_dir())]
+    firsts = (next((entry for entry in sorted(folder.iterdir()) if entry.is_file()), None) for folder in folders[:2])
+    return next((kind for file in firsts if file is not None and (kind := _vectors(file)) is not None), None)
 
 
 def _is_view(folder: Path) -> bool:

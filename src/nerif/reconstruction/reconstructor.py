@@ -155,7 +155,7 @@ class Reconstruction:
         return self.volume(grid).plot()
 
     def write(self, path: str | os.PathLike[str], grid: Grid | int = VOXELS, force: bool = False) -> None:
-        """Write the volume in the format of the ending of a file (.vti, .nc, .npz, .mat, .csv)."""
+        """Write the volume in the format of the ending of a file (.vti, .nc, .npz, .mat, .csv, .dat)."""
         self.volume(grid).write(path, force)
 
     def __repr__(self) -> str:

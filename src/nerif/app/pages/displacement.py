@@ -1,4 +1,4 @@
-"""Displacement: from the images of all views to a measurement, with a preview of one view first; masks drawn."""
+"""Displacement: from images, or vectors of another program, to a measurement; a preview of one view; masks drawn."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from nerif.app.project.workspace import Workspace
 from nerif.app.views.mask_editor import MaskCard
 from nerif.app.views.view_maps import maps_html
 from nerif.cli.commands.displacement import Displacement
+from nerif.cli.commands.vectors import Vectors
 from nerif.common.installation import word_of
 from nerif.data.measurement import Measurement
 from nerif.imaging.recording import measure_instant
@@ -25,6 +26,8 @@ from nerif.imaging.recording import measure_instant
 __all__ = ["PAGE"]
 
 BY_PAGE = ("config", "folder", "calibration", "out", "frames", "frame_rate", "frame_offset")
+VECTORS_BY_PAGE = ("config", "folder", "calibration", "out", "frame_rate", "force")
+VECTORS_MAIN = ("window", "first_image", "y_axis", "vector_unit", "scale", "time_step", "lower", "upper")
 MAIN = ("method", "smoothness", "lower", "upper", "max_sigma", "min_correlation", "shake_border", "images")
 
 
@@ -53,11 +56,43 @@ class DisplacementPage:
                     self.button = ui.button("Preview", icon="visibility", on_click=self.preview).props("outline")
                     self.display = ui.element("div").props('aria-live="polite"')
             self._views()
-        else:
-            gap = "are no images of an experiment" if not contents.experiments else "is no calibration"
+        elif not (contents.vectors and contents.calibrations):
+            images = contents.experiments or contents.vectors
+            gap = (
+                "is no calibration" if images else "are no images of an experiment, and no vectors of another program,"
+            )
             text_html(f"There {gap} in the folder yet; the pages before this one help.", classes="status")
+        if contents.vectors and contents.calibrations:
+            self._vectors_card(contents)
         self.below = ui.element("div").classes("stack")
         self._show(contents.measurements)
+
+    def _vectors_card(self, contents: Contents) -> None:
+        """Add the form that reads vectors of another program."""
+        draft = self.work.draft(f"{PAGE.name}.vectors")
+        about = "Of PIVlab, OpenPIV, DaVis, Insight, Dynamic Studio, or any table."
+        with card("Vectors of another program", about), ui.element("div").classes("form"):
+            folder = select("Folder of vectors", list(contents.vectors), draft.get("folder"))
+            calibration = select("Calibration", list(contents.calibrations), draft.get("calibration"))
+            out = text_field("Measurement to write", self.work.project.free_name("vectors.nc"))
+
+            def words() -> list[str]:
+                files = [str(folder.value), "--calibration", str(calibration.value)]
+                return ["vectors", *files, "--out", word_of(out.value)]
+
+            record = Vectors(Path("."), Path("."), Path("vectors.nc"))
+            job = JobForm(
+                self.work, f"{PAGE.name}.vectors.run", Form(record, without=VECTORS_BY_PAGE), words, "Read vectors",
+                VECTORS_MAIN, lambda: str(out.value), on_continue=self._show_new,
+            )  # fmt: skip
+            for control in (folder, calibration, out):
+                control.on_value_change(job.show)
+
+    async def _show_new(self, file: str) -> None:
+        """Show a measurement that a run has written."""
+        self._show(await self.work.measurements())
+        if self.measurement_card is not None:
+            await self.measurement_card.choice.choose(file)
 
     def _show(self, measurements: Sequence[str]) -> None:
         if measurements and self.measurement_card is None:
@@ -66,9 +101,7 @@ class DisplacementPage:
 
     async def _on_continue(self, file: str) -> None:
         """Show a measurement that a run has written, and give the next one a new name."""
-        self._show(await self.work.measurements())
-        if self.measurement_card is not None:
-            await self.measurement_card.choice.choose(file)
+        await self._show_new(file)
         self.out.set_value(self.work.project.free_name("measurement.nc"))
 
     def _words(self) -> list[str]:

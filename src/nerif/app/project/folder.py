@@ -15,7 +15,7 @@ from nerif.common.conventions import InputError
 from nerif.common.files import ending
 from nerif.common.installation import word_of
 from nerif.data.body_file import FORMATS
-from nerif.data.kinds import VOLUME, kind_of
+from nerif.data.kinds import VOLUME, are_vectors, kind_of
 from nerif.imaging.readers.views import View, find_views
 from nerif.results.directory import LIVE, RUN, check_links
 
@@ -34,6 +34,7 @@ class Contents:
     """Files of a project as paths relative to its folder, as a command takes them, sorted."""
 
     experiments: tuple[str, ...] = ()  #: folders of images that have views
+    vectors: tuple[str, ...] = ()  #: folders of vectors of other programs
     calibrations: tuple[str, ...] = ()  #: calibration files (.toml)
     measurements: tuple[str, ...] = ()  #: measurement files (.nc)
     results: tuple[str, ...] = ()  #: result directories, also of current runs
@@ -151,7 +152,7 @@ class ProjectFolder:
             if _is_result(path):
                 check_links(path)
                 return "results"
-            return "experiments" if _has_views(path) else ""
+            return "experiments" if _has_views(path) else "vectors" if are_vectors(kind_of(path)) else ""
         if ending(path) in FORMATS:
             return "models"
         if ending(path) == ".toml":

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from nerif.data.measurement_sequence import MeasurementSequence
     from nerif.imaging.recording import Recording
 
-__all__ = ["Displacement", "main", "run"]
+__all__ = ["Displacement", "main", "print_views", "run"]
 
 UNRECORDED = ("out", "force", "config", "frames", "frame_offset")  # or recorded by measure_recording
 
@@ -114,7 +114,7 @@ def run(settings: Displacement) -> Measurement:
         numbers = range(settings.frame, settings.frame + settings.average)
         measurement, noise = measure_instant(recording, numbers, say, bar)
     measurement.write(settings.out)
-    _print(measurement, noise)
+    print_views(measurement, noise)
     from nerif.report.displacement_figure import save_displacements
 
     save_displacements(image, measurement)
@@ -137,7 +137,7 @@ def _run_over_time(settings: Displacement, recording: Recording) -> MeasurementS
         return measure_recording(recording, numbers, times, out, attributes, settings.force, say, bar)
 
 
-def _print(measurement: Measurement, noise: Mapping[str, str]) -> None:
+def print_views(measurement: Measurement, noise: Mapping[str, str]) -> None:
     from nerif.data.measurement_summary import valid_pixels
     from nerif.forward.deflection import Deflection
 
