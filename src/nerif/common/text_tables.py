@@ -15,7 +15,7 @@ import numpy as np
 from nerif.common.conventions import InputError
 from nerif.common.files import check_file, reading
 
-__all__ = ["TextTable", "read_numbers", "read_text"]
+__all__ = ["TextTable", "read_numbers", "text_of"]
 
 NUMBER = re.compile(r"[+-]?(\d+[.,]?\d*|[.,]\d+)([eEdD][+-]?\d+)?|[+-]?nan|[+-]?inf", re.IGNORECASE)
 UNIT = re.compile(r"\s*[\[(]([^\])]*)[\])]")
@@ -33,7 +33,7 @@ class TextTable:
     head: tuple[str, ...]  #: lines before the first row of numbers
 
 
-def read_text(path: Path) -> str:
+def text_of(path: Path) -> str:
     """Return the text of a file in UTF-8, in UTF-16 with its mark (Excel's Unicode text) or in Windows-1252."""
     content = path.read_bytes()
     if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
@@ -49,7 +49,7 @@ def read_text(path: Path) -> str:
 def read_numbers(path: Path) -> TextTable:
     """Read rows of numbers under a head of any lines, of which one may name the columns."""
     check_file(path, "text file")
-    lines = read_text(path).splitlines()
+    lines = text_of(path).splitlines()
     start, separator = next(
         ((i, sep) for i, line in enumerate(lines[:MAX_HEAD_LINES]) if (sep := _separator(line))), (-1, "")
     )
@@ -62,10 +62,10 @@ def read_numbers(path: Path) -> TextTable:
         body = [line.replace(",", ".") for line in body]
     options: dict[str, Any] = {"delimiter": None if separator == " " else separator, "comments": None, "ndmin": 2}
     try:
-        values = np.loadtxt(body, encoding="utf-8", **options)
+        values = np.loadtxt(body, **options)
     except ValueError:  # cells are empty
         with reading("cannot be read as a table of numbers", path):
-            values = np.genfromtxt(body, encoding="utf-8", **options, usecols=range(len(cells)))
+            values = np.genfromtxt(body, **options, usecols=range(len(cells)))
     names = _names(lines[:start], len(cells), separator)
     plain = tuple(UNIT.sub("", name).strip(' #%"') for name in names)
     units = tuple(match[-1].strip() if (match := UNIT.findall(name)) else "" for name in names)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from nerif.common.conventions import InputError
-from nerif.common.text_tables import read_text
+from nerif.common.text_tables import text_of
 
 __all__ = ["Sheet", "read_sheet"]
 
@@ -62,7 +62,7 @@ class Sheet:
 
 def read_sheet(path: Path) -> Sheet:
     """Read the cells of a file, separated by tabs, semicolons or commas."""
-    numbered = [(i, text) for i, text in enumerate(read_text(path).splitlines(), 1) if text.strip()]
+    numbered = [(i, text) for i, text in enumerate(text_of(path).splitlines(), 1) if text.strip()]
     numbered = [(i, text) for i, text in numbered if not text.lstrip().startswith("#")]
     if numbered and (match := re.fullmatch(r"sep=(.)\s*", numbered[0][1], re.IGNORECASE)):  # Excel's own first line
         numbered, separator = numbered[1:], match[1]
