@@ -86,11 +86,11 @@ _ = axes.legend()
 # The density on the plate, as ``nerif reconstruct`` writes it to ``surface.vtp`` for ParaView and draws it in the
 # report.
 from nerif.analysis.wall_values import surface_map
-from nerif.physics.quantities import GasSettings
+from nerif.physics.gas import GasSettings
 from nerif.report.surface_figure import draw_surface
 
 surface = surface_map(
-    result.field, result.bodies, box, result.n_ambient, edge=0.8, gas=GasSettings()
+    result.field, result.bodies, box, result.n_ambient, edge=0.8, medium=GasSettings()
 )
 figure = plt.figure(figsize=(7, 3.5), layout="constrained")
 draw_surface(figure, surface, "density")

@@ -23,8 +23,8 @@ from .geometry import Plane as Plane
 from .geometry import Ring as Ring
 from .geometry import paper_rig as paper_rig
 from .imaging.vectors.vectors import read_vectors as read_vectors
-from .physics.quantities import GasSettings as GasSettings
-from .physics.quantities import derive as derive
+from .physics.gas import GasSettings as GasSettings
+from .physics.medium import derive as derive
 from .reconstruction.neural.neural import NeRIF as NeRIF
 from .reconstruction.neural.presets import preset as preset
 from .reconstruction.projector import Projector as Projector

@@ -14,8 +14,8 @@ from nerif.data.surface import SurfaceMap
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box
 from nerif.geometry.body import fine_triangles
+from nerif.physics.gas import GasSettings
 from nerif.physics.gas_optics import gladstone_dale
-from nerif.physics.quantities import GasSettings
 
 BOX = Box.cube(40.0)
 N_AMBIENT = 1.00027
@@ -24,7 +24,7 @@ N_AMBIENT = 1.00027
 @pytest.fixture(scope="module")
 def surface() -> SurfaceMap:
     bodies = [ball(6.0, (15.0, 0.0, 0.0))]
-    return surface_map(make_phantom("gaussians", BOX, 0), bodies, BOX, N_AMBIENT, 1.0, gas=GasSettings())
+    return surface_map(make_phantom("gaussians", BOX, 0), bodies, BOX, N_AMBIENT, 1.0, medium=GasSettings())
 
 
 def test_fine_triangles_cover_the_surface_and_have_short_edges():

@@ -16,7 +16,8 @@ from nerif.common.conventions import InputError
 from nerif.data.volume import FORMATS, Volume, export, write_netcdf
 from nerif.data.volume_file import read_volume, read_volumes
 from nerif.geometry import Box, Grid
-from nerif.physics.quantities import GasChanges, GasSettings, derive
+from nerif.physics.gas import GasChanges, GasSettings
+from nerif.physics.medium import derive
 from refusals import refused
 
 GRID = Grid(Box((-1.0, 2.0, -3.0), (3.0, 8.0, 7.0)), (5, 3, 4))

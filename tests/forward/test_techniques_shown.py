@@ -20,7 +20,7 @@ from nerif.data.volume import Volume, write_netcdf
 from nerif.data.volume_file import read_volume
 from nerif.forward.absorption import Absorption
 from nerif.geometry import Box, Grid
-from nerif.physics.quantities import GasSettings
+from nerif.physics.gas import GasSettings
 from nerif.plotting import drawing
 from nerif.report import packing
 from nerif.report.journal_figures import error_of, figures_of, view

@@ -24,7 +24,8 @@ from nerif.forward.path_integral import PathIntegral
 from nerif.forward.ray_tracing import background_points
 from nerif.forward.registry import TECHNIQUES, forward_model
 from nerif.geometry import PROJECTIONS, TELECENTRIC, Camera, Grid, Rays, Ring
-from nerif.physics.quantities import GasSettings, derive
+from nerif.physics.gas import GasSettings
+from nerif.physics.medium import derive
 from nerif.reconstruction.bins import binned_rays
 from nerif.reconstruction.gauge import visual_hull
 from nerif.reconstruction.voxels.operator import VoxelOperator

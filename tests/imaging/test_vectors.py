@@ -193,7 +193,7 @@ def _rows(step: float = 8, names: str = "x,y,u,v", values: str = "0.1,0.2", firs
         (_rows(step=40), "expected vectors within the 168 x 200 px"),
         (_rows().replace("16,8", "19,8"), "at equal distances"),
         (_rows() + "\n8,8,0.1,0.2", "expected one vector at a position, got several"),
-        ("x,y,u,v\nno numbers here", "expected rows of at least four numbers"),
+        ("x,y,u,v\nno numbers here", "expected rows of at least 4 numbers"),
         (_rows(names="x,y,u,v,w", values="0.1,0.2,0.3"), "expected two components of one camera, got three"),
         (_rows(values="nan,nan"), "no vector that its flags allow"),
     ],

@@ -10,8 +10,9 @@ import torch
 from nerif.data.volume import Volume
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Grid
+from nerif.physics.gas import NOT_UNIFORM, GasChanges, GasSettings
 from nerif.physics.gas_optics import ambient_index
-from nerif.physics.quantities import NOT_UNIFORM, GasChanges, GasSettings, derive, derive_all, deviation
+from nerif.physics.medium import derive, derive_all, deviation
 from refusals import refused
 
 

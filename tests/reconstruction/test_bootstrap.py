@@ -12,7 +12,7 @@ from nerif.analysis.prediction import reproject
 from nerif.data.volume import Volume
 from nerif.fields.voxel_field import VoxelField
 from nerif.geometry import Box, Grid, Ring
-from nerif.physics.quantities import GasSettings
+from nerif.physics.gas import GasSettings
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.reconstructor import Outcome, Reconstruction
 from nerif.reconstruction.rig_refinement import Refinement

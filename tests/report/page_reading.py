@@ -21,6 +21,11 @@ def unpack(packed: dict[str, Any], shape: tuple[int, ...]) -> np.ndarray:
 
 def quantity_of(relation: dict[str, Any], x: np.ndarray) -> np.ndarray:
     """The quantity of an index excess, NaN where masked."""
+    if relation["kind"] == "table":
+        values = np.array(relation["values"], dtype=np.float64)
+        t = (x - relation["low"]) / relation["step"]
+        i = np.clip(np.floor(t), 0, len(values) - 2).astype(int)
+        return values[i] + (values[i + 1] - values[i]) * (t - i)
     with np.errstate(divide="ignore", invalid="ignore"):
         shifted = x.astype(np.float64) + relation["offset"]
         q = shifted * relation["factor"] if relation["kind"] == "linear" else relation["factor"] / shifted

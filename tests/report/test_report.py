@@ -15,7 +15,8 @@ from nerif.data.reprojection import Reprojection
 from nerif.data.volume import Volume
 from nerif.geometry import Box, Grid
 from nerif.geometry.symmetry import Axis, Symmetry
-from nerif.physics.quantities import GasSettings, derive
+from nerif.physics.gas import GasSettings
+from nerif.physics.medium import derive
 from nerif.plotting.notebook import number
 from nerif.report import html, packing
 from nerif.report.result_plots import residuals_over_sigma

@@ -12,8 +12,7 @@ from nerif.data.surface import SurfaceMap
 from nerif.fields.field import Field, in_chunks
 from nerif.geometry import Box
 from nerif.geometry.body import Body, contained, fine_triangles
-from nerif.physics.gas_optics import density_from_index, gladstone_dale
-from nerif.physics.quantities import GasSettings
+from nerif.physics.medium import Medium
 
 __all__ = ["surface_map"]
 
@@ -24,9 +23,11 @@ OUTWARDS = 1e-3  # of the edges of the triangles, by which points are off the su
 @torch.no_grad()
 def surface_map(
     field: Field, bodies: Sequence[Body], box: Box, n_ambient: float, edge: float, quantity: str = INDEX,
-    gas: GasSettings | None = None,
+    medium: Medium | None = None,
 ) -> SurfaceMap:  # fmt: skip
-    """Return a field, and in a gas its density, on the surface of bodies in triangles with edges up to `edge` mm.
+    """Return a field, and what follows in a medium, such as density, on the surface of bodies.
+
+    Triangles have edges up to `edge` mm.
 
     Triangles outside the box are left out; they are larger where there would be more than MOST_TRIANGLES. Vertices
     beyond the box or within another body are NaN.
@@ -38,10 +39,10 @@ def surface_map(
     values = torch.cat([field.value(part).double() for part in in_chunks(points.float())])
     values = values.masked_fill(outside, torch.nan)
     quantities, attributes = {quantity: values}, dict[str, float | str]()
-    if quantity == INDEX and gas is not None:
-        k = gladstone_dale(gas.composition, gas.wavelength_nm)
-        quantities = {"density": density_from_index(values, n_ambient, k), **quantities}
-        attributes = {"n_ambient": n_ambient, "gas": gas.composition, "gladstone_dale_m3_kg-1": k}
+    if quantity == INDEX and medium is not None:
+        derived = {name: medium.values(values, n_ambient, name)[0] for name in medium.surface_names}
+        quantities = {**derived, **quantities}
+        attributes = {"n_ambient": n_ambient, **medium.attributes(medium.surface_names[0])}
     return SurfaceMap(points, faces, {n: v.float() for n, v in quantities.items()}, attributes)
 
 

@@ -46,15 +46,15 @@ def text_of(path: Path) -> str:
     raise InputError("not a text file in UTF-8 or UTF-16", field=path)
 
 
-def read_numbers(path: Path) -> TextTable:
-    """Read rows of numbers under a head of any lines, of which one may name the columns."""
+def read_numbers(path: Path, least: int = 4) -> TextTable:
+    """Read rows of at least `least` numbers under a head of any lines, of which one may name the columns."""
     check_file(path, "text file")
     lines = text_of(path).splitlines()
     start, separator = next(
-        ((i, sep) for i, line in enumerate(lines[:MAX_HEAD_LINES]) if (sep := _separator(line))), (-1, "")
+        ((i, sep) for i, line in enumerate(lines[:MAX_HEAD_LINES]) if (sep := _separator(line, least))), (-1, "")
     )
     if start < 0:
-        raise InputError("expected rows of at least four numbers, got none", field=path)
+        raise InputError(f"expected rows of at least {least} numbers, got none", field=path)
     cells = _cells(lines[start], separator)
     commas = separator != "," and any("," in cell for cell in cells)
     body = list(itertools.takewhile(lambda line: _is_row(line, separator), filter(str.strip, lines[start:])))
@@ -82,12 +82,12 @@ def _cells(line: str, separator: str) -> list[str]:
     return [cell.strip() for cell in cells]
 
 
-def _separator(line: str) -> str:
-    """Return the separator of a row of at least four numbers (some cells may be empty); "" for any other line."""
+def _separator(line: str, least: int) -> str:
+    """Return the separator of a row of numbers (some cells may be empty); "" for any other line."""
     for separator in ("\t", ";", ",", " "):
         cells = _cells(line, separator)
         numbers = [cell for cell in cells if NUMBER.fullmatch(cell)]
-        if len(numbers) >= 4 and len(numbers) >= len(cells) - 2 and all(NUMBER.fullmatch(c) for c in cells[:2]):
+        if len(numbers) >= least and len(numbers) >= len(cells) - 2 and all(NUMBER.fullmatch(c) for c in cells[:2]):
             return separator
     return ""
 

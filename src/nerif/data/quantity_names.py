@@ -15,6 +15,13 @@ QUANTITIES = {
     "n": ("1", "refractive index"),
     "density": ("kg m-3", "density"),
     "temperature": ("K", "temperature"),
+    "mole_fraction": ("1", "mole fraction"),
+    "mass_fraction": ("1", "mass fraction"),
+    "static_pressure": ("Pa", "static pressure"),
+    "mach": ("1", "Mach number"),
+    "pressure_coefficient": ("1", "pressure coefficient"),
+    "salinity": ("g kg-1", "salinity"),
+    "electron_density": ("m-3", "electron density"),
     "extinction": ("mm-1", "extinction coefficient"),
     "emission": ("mm-1", "radiance per length"),
 }
@@ -33,11 +40,11 @@ FLOW_QUANTITIES = {
 """Unit and long name of the quantities of a flow."""
 
 INDEX = "index_excess"
-INDEX_QUANTITIES = (INDEX, "n", "density", "temperature")
+INDEX_QUANTITIES = (INDEX, *(name for name in QUANTITIES if name not in (INDEX, "extinction", "emission")))
 
 
 def quantities_of(quantity: str) -> tuple[str, ...]:
-    """Return the quantities that follow from a reconstructed field."""
+    """Return the quantities that follow from a reconstructed field in some medium."""
     return INDEX_QUANTITIES if quantity == INDEX else (quantity,)
 
 

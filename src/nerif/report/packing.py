@@ -7,6 +7,7 @@ The page contains the reconstructed field once; n, density and temperature are f
 from __future__ import annotations
 
 import base64
+import math
 import zlib
 from typing import Any
 
@@ -17,18 +18,27 @@ from jaxtyping import Float
 from nerif.data.quantity_names import INDEX, quantities_of
 from nerif.data.volume import Volume
 from nerif.geometry import Grid
+from nerif.physics.gas import TEMPERATURE_RANGE
 from nerif.physics.gas_optics import GAS_CONSTANT
-from nerif.physics.quantities import TEMPERATURE_RANGE
+from nerif.physics.medium import Medium
 
 __all__ = ["COARSE", "FINE", "MASKED", "MAX_VOXELS", "coarsen", "pack", "relation"]
 
 MAX_VOXELS = 128  # along the longest edge; finer volumes are averaged, as the page says
 MASKED = 65535
+TABLE_POINTS = 513
 FINE, COARSE = 65534, 4095  # levels
 
 
+def tabulated(quantity: str, medium: Medium, n_ambient: float, low: float, high: float) -> dict[str, Any]:
+    """Return a quantity of a medium at equal steps of the index excess from low to high, None where it is masked."""
+    excess = torch.linspace(low, high, TABLE_POINTS, dtype=torch.float64)
+    values = [v if math.isfinite(v) else None for v in medium.values(excess, n_ambient, quantity)[0].tolist()]
+    return {"kind": "table", "low": low, "step": (high - low) / (TABLE_POINTS - 1) or 1.0, "values": values}
+
+
 def relation(quantity: str, attributes: dict[str, float | str]) -> dict[str, Any]:
-    """Return how n - 1, density or temperature q follow from the index excess x, by the attributes of the file.
+    """Return how n - 1, density or temperature q of a gas follow from the index excess x, by attributes of the file.
 
         linear: q = (x + offset) factor,      reciprocal: q = factor / (x + offset)
 

@@ -9,11 +9,13 @@ import numpy as np
 import torch
 
 from nerif.common.conventions import unit_shown
-from nerif.data.quantity_names import INDEX, name_of, quantities_of
+from nerif.data.quantity_names import INDEX, name_of
 from nerif.data.volume import Volume
 from nerif.data.volume_sequence import VolumeSequence
 from nerif.geometry import Grid
-from nerif.physics.quantities import GasSettings, derive
+from nerif.physics.gas import GasSettings
+from nerif.physics.media import stored_medium
+from nerif.physics.medium import Medium, derive
 from nerif.plotting.drawing import (
     COLOUR_MAPS,
     DIVERGING,
@@ -48,10 +50,14 @@ def scene_of(result: Result) -> tuple[dict[str, Any] | None, dict[str, str]]:
         sources["error"] = packing.coarsen(error)
     if f"{field.quantity}_std" in result.volumes:
         sources["std"] = packing.coarsen(result.volumes[f"{field.quantity}_std"])
-    for quantity in ("density", "temperature"):
+    ends = (float(small.values.nan_to_num().min()), float(small.values.nan_to_num().max()))
+    medium = stored_medium(result.settings)
+    entries = {q: _quantity(q, result.volumes[q], default_level(result.volumes[q]), medium, ends) for q in quantities}
+    for quantity in quantities:
         std = result.volumes.get(f"{quantity}_std")
         # others are a linear function of that of the excess
-        if std is not None and (quantity == "temperature" or not bool(torch.isfinite(std.values).all())):
+        linear = entries[quantity]["relation"]["kind"] == "linear"
+        if std is not None and not (linear and bool(torch.isfinite(std.values).all())):
             sources[std.quantity] = packing.coarsen(std)
     packed = {
         name: packing.pack(volume.values.double().numpy(), packing.FINE if name == "value" else packing.COARSE)
@@ -62,7 +68,6 @@ def scene_of(result: Result) -> tuple[dict[str, Any] | None, dict[str, str]]:
         variants["std"] = "Standard deviation"
     if "error" in sources:
         variants |= {"truth": "Truth", "error": "Error"}
-    entries = {q: _quantity(q, result.volumes[q], default_level(result.volumes[q])) for q in quantities}
     scene = {
         **_scene(small.grid, field.grid, entries, variants, (DIVERGING, "cividis")),
         "arrays": {name: {"low": p["low"], "step": p["step"]} for name, p in packed.items()},
@@ -77,15 +82,20 @@ def scene_over_time(store: VolumeSequence, frames: list[int], field: str) -> tup
     """Return the scene of a quantity in some frames of a sequence, and the packed volumes by name."""
     small = [packing.coarsen(store.volume(i, field), MAX_FRAME_VOXELS) for i in frames]
     packed = [packing.pack(v.values.double().numpy(), packing.COARSE) for v in small]
-    gas = GasSettings(**store.attributes["gas"]) if "gas" in store.attributes else None
+    medium = stored_medium(store.attributes)
     quantities = {}
     some = small[:: max(1, len(small) // 8)]
-    absent = {name for v in some for name in gas.absent(v)} if gas is not None else {"density", "temperature"}
-    for name in plotted_quantities([q for q in quantities_of(field) if q not in absent]):
-        sample = [derive(v, name, gas or GasSettings()) for v in some]
+    absent = {name for v in some for name in medium.absent(v)} if medium is not None else {*GasSettings.names}
+    medium_of_page = medium or GasSettings()
+    extremes = (
+        min(float(v.values.nan_to_num().min()) for v in small),
+        max(float(v.values.nan_to_num().max()) for v in small),
+    )
+    for name in plotted_quantities([q for q in medium_of_page.available(field) if q not in absent]):
+        sample = [derive(v, name, medium_of_page) for v in some]
         ends = [colour_range(plotted_values(v)) for v in sample]
         quantities[name] = {
-            **_quantity(name, sample[0], float(np.median([default_level(v) for v in sample]))),
+            **_quantity(name, sample[0], float(np.median([default_level(v) for v in sample])), medium, extremes),
             "range": [min(e[0] for e in ends), max(e[1] for e in ends)],
         }
     scales = [{"low": p["low"], "step": p["step"]} for p in packed]
@@ -100,14 +110,20 @@ def scene_over_time(store: VolumeSequence, frames: list[int], field: str) -> tup
     return scene, arrays | {f"frame-{k}": p["text"] for k, p in enumerate(packed)}
 
 
-def _quantity(name: str, volume: Volume, level: float) -> dict[str, Any]:
-    """Labels and colours of a quantity, its relation to the field, and the level of its isosurface."""
+def _quantity(
+    name: str, volume: Volume, level: float, medium: Medium | None, ends: tuple[float, float]
+) -> dict[str, Any]:  # fmt: skip
+    """Labels and colours of a quantity, its relation to the field between two ends, and the level of its isosurface."""
+    if medium is None or isinstance(medium, GasSettings) or name not in medium.names:
+        relation = packing.relation(name, volume.attributes)
+    else:
+        relation = packing.tabulated(name, medium, float(volume.attributes["n_ambient"]), *ends)
     label, unit = LABELS.get(name, (name, volume.unit))
     return {
         "button": name_of(name).capitalize(),
         "label": label,
         "unit": unit_shown(unit),
-        "relation": packing.relation(name, volume.attributes),
+        "relation": relation,
         "colours": COLOUR_MAPS.get(name, SEQUENTIAL),
         "level": level,
     }

@@ -17,7 +17,7 @@ from nerif.common.conventions import percent, with_unit
 from nerif.data.quantity_names import INDEX, field_of, name_of
 from nerif.forward.registry import TECHNIQUES
 from nerif.geometry.symmetry import Axis
-from nerif.physics.quantities import GasChanges
+from nerif.physics.media import stored_medium
 from nerif.plotting.drawing import LABELS, plotted_quantities, plotted_values
 from nerif.plotting.notebook import number, span
 from nerif.reconstruction.field_files import FIELD
@@ -85,7 +85,7 @@ def field_rows(result: Result) -> Rows:
 def _ambient_temperature(result: Result) -> float | None:
     """Temperature that corresponds to n_ambient in the assumed gas, K."""
     volume = result.volumes.get("temperature")
-    if volume is None:
+    if volume is None or "molar_mass_kg_mol-1" not in volume.attributes:
         return None
     ambient = relation("temperature", volume.attributes)
     return ambient["factor"] / ambient["offset"] if ambient["offset"] > 0 else None
@@ -295,11 +295,12 @@ def _of_truth(result: Result) -> list[Statement]:
 
 
 def _of_gas(result: Result) -> list[Statement]:
-    if (field := result.field) is None or "gas" not in result.settings or field.n_ambient is None:
+    medium = stored_medium(result.settings)
+    if (field := result.field) is None or medium is None or field.n_ambient is None:
         return []
     return [
         Statement("warning" if line.startswith("density") else "note", f"{line[0].upper()}{line[1:]}.")
-        for line in GasChanges().of(result.settings).remarks(field)
+        for line in medium.remarks(field)
     ]
 
 
@@ -330,14 +331,14 @@ def _of_axis(result: Result) -> list[Statement]:
 
 def _of_masks(result: Result) -> list[Statement]:
     remarks = []
-    for quantity in ("density", "temperature"):
-        volume = result.volumes.get(quantity)
-        count = int(volume.notes.get("masked_voxels", 0)) if volume is not None else 0
-        if volume is None or not count:
+    for quantity in plotted_quantities(result.volumes):
+        volume = result.volumes[quantity]
+        count = int(volume.notes.get("masked_voxels", 0))
+        if not count:
             continue
         share = count / volume.values.numel()
         voxels = "voxel" if count == 1 else "voxels"
         where = volume.notes.get("masked_where")
-        text = f"{quantity.capitalize()} is masked in {count} {voxels} ({percent(share, 2)}): {where}."
+        text = f"{name_of(quantity).capitalize()} is masked in {count} {voxels} ({percent(share, 2)}): {where}."
         remarks.append(Statement("note" if share < 0.05 else "warning", text))
     return remarks

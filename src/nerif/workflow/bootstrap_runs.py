@@ -11,7 +11,7 @@ from nerif.data.measurement import Measurement
 from nerif.data.volume import Volume
 from nerif.fields.field import Field
 from nerif.geometry import Grid
-from nerif.physics.quantities import GasSettings, derive_all, masked_lines
+from nerif.physics.medium import Medium, derive_all, masked_lines
 from nerif.reconstruction.progress import Monitor
 from nerif.reconstruction.reconstructor import Reconstruction
 from nerif.reconstruction.uncertainty.bootstrap import BootstrapDeviations, Maps, Original
@@ -23,9 +23,9 @@ from nerif.workflow.reconstruction_run import ReconstructionRun, StepOutputs
 __all__ = ["all_quantities", "bootstrap", "write_deviations"]
 
 
-def all_quantities(result: Reconstruction, gas: GasSettings, voxels: int) -> list[Volume]:
+def all_quantities(result: Reconstruction, medium: Medium, voxels: int) -> list[Volume]:
     """Sample a field and all derived quantities, `voxels` along the longest edge."""
-    return derive_all(result.volume(Grid.of_resolution(result.box, voxels)), gas)
+    return derive_all(result.volume(Grid.of_resolution(result.box, voxels)), medium)
 
 
 def write_deviations(
@@ -64,7 +64,7 @@ def bootstrap(run: ReconstructionRun, so_far: StepOutputs) -> StepOutputs:
 
     say, start, diverged = monitor.say, time.monotonic(), []
     base = Original(main, run.reconstructor, run.inputs.training, projections, so_far.rig)
-    deviations = BootstrapDeviations(so_far.quantities[0], run.settings.gas, base)
+    deviations = BootstrapDeviations(so_far.quantities[0], run.settings.substance, base)
     for number in range(1, count + 1):
         member, every = run.trials.member(number, base), run.settings.checkpoint_every
         settings = so_far.budget.limited(member.reconstructor, 1 / (count - number + 1))

@@ -33,8 +33,9 @@ from nerif.flow.box_domain import BoxDomain, section_of
 from nerif.flow.film_density import FilmDensity
 from nerif.flow.flow import Flow
 from nerif.geometry.symmetry import Symmetry
+from nerif.physics.gas import GasSettings
 from nerif.physics.gas_optics import density_from_index, gladstone_dale
-from nerif.physics.quantities import GasSettings
+from nerif.physics.media import stored_medium
 from nerif.reconstruction.field_files import digest, read_tensors, write_tensors
 from nerif.reconstruction.projector import Projector
 
@@ -224,7 +225,8 @@ def _write(
     section: BoxDomain, say: Callable[[str], None],
 ) -> VelocitySequence:  # fmt: skip
     """Write a flow on the grid of the film, in SI units."""
-    gas = GasSettings(**film.attributes["gas"]) if "gas" in film.attributes else GasSettings()
+    medium = stored_medium(film.attributes) or GasSettings()
+    gas = medium if isinstance(medium, GasSettings) else GasSettings()
     constant = gladstone_dale(gas.composition, gas.wavelength_nm)
     density = float(density_from_index(0.0, film.n_ambient, constant))
     more = ["transport_residual", "density"]

@@ -16,13 +16,14 @@ from nerif.common.conventions import InputError, percent
 from nerif.common.memory import free_memory
 from nerif.common.settings import with_present_names
 from nerif.data.measurement import Measurement
-from nerif.data.quantity_names import quantities_of
+from nerif.data.quantity_names import INDEX
 from nerif.data.reprojection import Reprojection
 from nerif.data.volume import Volume
 from nerif.fields.field import Field
 from nerif.fields.symmetric import SymmetricVoxels
 from nerif.fields.voxel_field import VoxelField
 from nerif.geometry import Box, Grid
+from nerif.physics.media import MEDIA
 from nerif.reconstruction.aperture import apply_aperture
 from nerif.reconstruction.detail.detail import DetailChoice, Posterior, check_sigma
 from nerif.reconstruction.field_files import CHECKPOINT
@@ -165,7 +166,7 @@ class ReconstructionRun:
             voxels = getattr(requested, "voxels", VOXELS)
         check_written(Grid.of_resolution(inputs.box, voxels))
         trials, budget = Trials(settings.uncertainty), Budget.of(reconstructor, inputs.training, voxels, since)
-        settings = replace(settings, gas=settings.gas.for_measurement(inputs.measurement))
+        settings = settings.with_substance(settings.substance.for_measurement(inputs.measurement))
         for line in inputs.remarks:
             monitor.say(line)
         if settings.detail == "on":
@@ -214,8 +215,9 @@ class ReconstructionRun:
         entries |= {name: requested[name] for name in ("open_faces", "voxels") if name in requested}
         if settings.start_from is not None:
             entries["start_from"] = settings.start_from.resolve()
-        if "density" not in quantities_of(self.inputs.measurement.quantity):
-            del entries["gas"]
+        entries = {name: value for name, value in entries.items() if name not in ("medium", *MEDIA)}
+        if self.inputs.measurement.quantity == INDEX:
+            entries |= settings.medium_entries
         file = None if path is None else str(path.resolve())
         head = {"measurement": file, "method": method_name(self.reconstructor), "voxels": self.voxels}
         return with_present_names({**head, **entries})

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
 from annotated_types import Ge
 
-from nerif.common.settings import Checked, NonNegative
-from nerif.physics.quantities import GasSettings
+from nerif.common.settings import NonNegative
+from nerif.physics.media import MediumSettings
 
 __all__ = ["AUTO", "NONE", "Run", "RunSettings"]
 
@@ -19,7 +19,7 @@ NONE: tuple[str, ...] = ("none",)
 
 
 @dataclass(frozen=True)
-class RunSettings(Checked):
+class RunSettings(MediumSettings):
     """Settings of a reconstruction into a directory, in addition to those of the method."""
 
     withhold: tuple[str, ...] = AUTO
@@ -45,8 +45,6 @@ class RunSettings(Checked):
     threads: Annotated[int, Ge(0)] = 0
     """Threads on a CPU (0: as many as there are free cores). With a fixed number, runs without a time limit have the
     same result to the last digit."""
-    gas: GasSettings = field(default_factory=GasSettings)
-    """Gas for density and temperature."""
 
 
 Run = RunSettings  #: the name of the class in earlier versions

@@ -26,7 +26,7 @@ from nerif.data.cameras_file import CalibratedCamera, write_cameras
 from nerif.data.measurement import Measurement
 from nerif.data.quantity_names import describe
 from nerif.geometry import Grid
-from nerif.physics.quantities import masked_lines
+from nerif.physics.medium import masked_lines
 from nerif.reconstruction.detail.detail import COARSE, EARLY, ITERATIONS, SIGNIFICANT, Detail, DetailChoice, choose
 from nerif.reconstruction.field_files import checkpoints
 from nerif.reconstruction.neural.neural import NeRIF
@@ -185,9 +185,9 @@ def write_field(run: ReconstructionRun, so_far: StepOutputs) -> StepOutputs:
     with run.monitor.counting("sampling the field"):
         splines = splines_for_views(result.field, so_far.measurement, result.device, spline_voxels(run.voxels))
         field = on_grid(result.field, splines, Grid.of_resolution(result.box, run.voxels))
-        volumes = all_quantities(replace(result, field=field), run.settings.gas, run.voxels)
+        volumes = all_quantities(replace(result, field=field), run.settings.substance, run.voxels)
         out.write_volumes(volumes)
-    for line in (*masked_lines(volumes), *run.settings.gas.remarks(volumes[0])):
+    for line in (*masked_lines(volumes), *run.settings.substance.remarks(volumes[0])):
         say(line)
     out.write_metrics(  # without the sections of an earlier field
         Metrics(
@@ -207,14 +207,17 @@ def write_surface(run: ReconstructionRun, so_far: StepOutputs) -> StepOutputs:
     result = so_far.the_result
     if not result.bodies:
         return so_far
-    gas = run.settings.gas if any(v.quantity == "density" for v in so_far.quantities) else None
+    names, medium = {v.quantity for v in so_far.quantities}, run.settings.substance
+    follows = not names.isdisjoint(medium.surface_names)
     edge = max(result.box.edges) / run.voxels
-    surface = surface_map(result.field, result.bodies, result.box, result.n_ambient, edge, result.quantity, gas)
+    surface = surface_map(
+        result.field, result.bodies, result.box, result.n_ambient, edge, result.quantity, medium if follows else None
+    )
     run.out.write_surface(surface)
     for name, values in surface.quantities.items():
-        present = values[values.isfinite()]
-        if len(present):
-            low, high = np.quantile(present, [0.001, 0.999])
+        finite = values[values.isfinite()]
+        if len(finite):
+            low, high = np.quantile(finite, [0.001, 0.999])
             unit = unit_shown(describe(name)[0])
             run.monitor.say(f"surface of the bodies: {name} {low:.4g} to {high:.4g} {unit} (0.1 to 99.9 %)")
     return so_far
@@ -285,7 +288,7 @@ def draw_errors(run: ReconstructionRun, so_far: StepOutputs) -> StepOutputs:
         return so_far
     assert so_far.posterior is not None
     begin = time.monotonic()
-    deviations = Deviations(so_far.quantities[0], run.settings.gas, so_far.the_result.bodies)
+    deviations = Deviations(so_far.quantities[0], run.settings.substance, so_far.the_result.bodies)
     grid, ratio = Grid.of_resolution(so_far.measurement.box, VOXELS), 1.0
     if so_far.detail is not None and (coarse := coarse_detail(run)) is not None:
         with run.monitor.counting("errors of the withheld view"):

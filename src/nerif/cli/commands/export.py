@@ -11,9 +11,9 @@ from nerif.cli.output import counting_bar, say
 from nerif.cli.settings import Settings, command
 from nerif.common.conventions import InputError
 from nerif.common.files import ending
-from nerif.common.settings import Positional
-from nerif.data.quantity_names import quantities_of
-from nerif.physics.quantities import GasChanges, derive, masked_lines
+from nerif.common.settings import Flat, Positional
+from nerif.physics.media import MediumChanges
+from nerif.physics.medium import derive, masked_lines
 
 if TYPE_CHECKING:
     from nerif.geometry import Box, Grid
@@ -37,8 +37,8 @@ class Export(Settings):
     format: Literal["field", "astra", "tigre"] = "field"
     """What to write: the field, or cameras and grid for astra or tigre."""
     quantities: tuple[str, ...] = ()
-    """Quantities to write; of an index index_excess (1), n (1), density (kg/m3), temperature (K) (default: all but
-    temperature)."""
+    """Quantities to write; of an index index_excess, n and those of the medium, such as density (default: all, but
+    not the temperature of a gas)."""
     frame: int | None = None
     """Frame of volumes over time, counted from 0, on their own voxels (default: all, with .pvd or .dat)."""
     voxels: int = 100
@@ -51,8 +51,7 @@ class Export(Settings):
     """Upper corner x y z of the region, mm."""
     force: bool = False
     """Overwrite an existing file, or folder of frames or planes."""
-    gas: GasChanges = field(default_factory=GasChanges)
-    """Gas for density and temperature."""
+    medium: Annotated[MediumChanges, Flat] = field(default_factory=MediumChanges)
 
 
 def run(settings: Export) -> None:
@@ -89,17 +88,17 @@ def run(settings: Export) -> None:
     (_, whole, _), quantity = result.field(), result.quantity()
     grid = _grid(settings, whole)
     with counting_bar("sampling the field"):
-        reconstruction, gas = result.sample(grid), settings.gas.of(result.settings())
-    absent = gas.absent(reconstruction)
+        reconstruction, medium = result.sample(grid), settings.medium.of(result.settings())
+    absent = medium.absent(reconstruction)
     for name in settings.quantities:
         if name in absent:
             raise InputError(f"{name} does not follow from the field: {absent[name]}", field="quantities")
-    default = tuple(q for q in quantities_of(quantity) if q not in ("temperature", *absent))
-    volumes = [derive(reconstruction, q, gas) for q in settings.quantities or default]
+    default = tuple(q for q in medium.available(quantity) if q not in {*absent, *medium.optional})
+    volumes = [derive(reconstruction, q, medium) for q in settings.quantities or default]
     export(settings.out, volumes, settings.force)
     names = ", ".join(v.quantity for v in volumes)
     say(f"{settings.out}: {names} on {' x '.join(map(str, grid.shape))} voxels (z, y, x)")
-    for line in (*masked_lines(volumes), *gas.remarks(reconstruction)):
+    for line in (*masked_lines(volumes), *medium.remarks(reconstruction)):
         say(line)
 
 

@@ -39,7 +39,7 @@ from nerif.fields.field import Field
 from nerif.fields.voxel_field import VoxelField
 from nerif.geometry import Camera, Grid
 from nerif.geometry.body import contained
-from nerif.physics.quantities import GasSettings
+from nerif.physics.medium import Medium
 from nerif.reconstruction.reconstructor import Reconstruction, Reconstructor
 from nerif.reconstruction.rig_parameters import with_corrections
 from nerif.reconstruction.uncertainty.deviations import VOXELS, Deviations, blurred
@@ -158,8 +158,8 @@ class BootstrapDeviations(Deviations):
     `original` is the reconstruction that they repeat.
     """
 
-    def __init__(self, main: Volume, gas: GasSettings, original: Original) -> None:
-        super().__init__(main, gas, original.result.bodies)
+    def __init__(self, main: Volume, medium: Medium, original: Original) -> None:
+        super().__init__(main, medium, original.result.bodies)
         self.original = original
         self.pixel = mean(original.measurement.pixel_sizes)  # mm, in the middle of the box
         self.detail: list[tuple[float, float]] = []  # mean square of a trial and of its truth, where that has any

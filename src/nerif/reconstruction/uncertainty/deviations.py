@@ -20,7 +20,8 @@ from nerif.data.volume import Volume
 from nerif.fields.voxel_field import VoxelField
 from nerif.geometry import Grid
 from nerif.geometry.body import Body, contained
-from nerif.physics.quantities import GasSettings, derive, deviation
+from nerif.physics.gas import GasSettings
+from nerif.physics.medium import Medium, derive, deviation
 
 __all__ = ["TAILS", "VOXELS", "Deviations", "blurred", "certainty"]
 
@@ -56,8 +57,8 @@ class Deviations:
     `main` is the field on the grid of the result; errors within bodies do not count.
     """
 
-    def __init__(self, main: Volume, gas: GasSettings, bodies: Sequence[Body] = ()) -> None:
-        self.main, self.gas, self.bodies = main, gas, bodies
+    def __init__(self, main: Volume, medium: Medium, bodies: Sequence[Body] = ()) -> None:
+        self.main, self.medium, self.bodies = main, medium, bodies
         self.squares: list[Tensor] = []
         self.grid: Grid | None = None
 
@@ -99,20 +100,20 @@ class Deviations:
         """
         std = self.std().values.double()
         volumes = []
-        for quantity in self.gas.quantities_of(self.main):
-            volumes.append(self._statistic(quantity, "std", deviation(self.main, std, quantity, self.gas)))
-            if quantity == "temperature":
+        for quantity in self.medium.quantities_of(self.main):
+            volumes.append(self._statistic(quantity, "std", deviation(self.main, std, quantity, self.medium)))
+            if quantity == "temperature" and isinstance(self.medium, GasSettings):
                 for name, z in TAILS.items():
                     values = self.main.values.double() - z * std  # temperature falls as the index rises
                     n_ambient = float(self.main.attributes.get("n_ambient", 1.0))
                     tail = Volume.of(values, self.main.grid, self.main.quantity, n_ambient)
-                    gas = replace(self.gas, uniform_pressure="yes")  # as in the field
+                    gas = replace(self.medium, uniform_pressure="yes")  # as in the field
                     volumes.append(self._statistic(quantity, name, derive(tail, quantity, gas).values.double()))
         return volumes
 
     def _statistic(self, quantity: str, statistic: str, values: Tensor) -> Volume:
         label = f"{quantity}_{statistic}"
-        derived = derive(self.main, quantity, self.gas)
+        derived = derive(self.main, quantity, self.medium)
         notes: dict[str, float | str] = {"trials": self.count}
         if "assumption" in derived.notes:
             masked = {"masked_voxels": int(torch.isnan(values).sum()), "masked_where": derived.notes["masked_where"]}

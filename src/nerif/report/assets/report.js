@@ -17,8 +17,13 @@ async function unpack(name, about, count) {
   return values;
 }
 
-// n - 1, density or temperature of an index excess; NaN where the relation breaks down
+// the quantity of an index excess; NaN where the relation breaks down
 function quantityOf(relation, x) {
+  if (relation.kind === "table") {
+    const t = (x - relation.low) / relation.step, i = Math.min(Math.max(Math.floor(t), 0), relation.values.length - 2);
+    const a = relation.values[i], b = relation.values[i + 1];
+    return a === null || b === null ? NaN : a + (b - a) * (t - i);
+  }
   const shifted = x + relation.offset;
   const q = relation.kind === "linear" ? shifted * relation.factor : relation.factor / shifted;
   if (relation.lower !== null && !(shifted > 0)) return NaN;

@@ -25,7 +25,7 @@ from nerif.fields.network import NeuralField
 from nerif.forward.path_integral import PathIntegral, project
 from nerif.forward.registry import forward_model
 from nerif.geometry import Grid
-from nerif.physics.quantities import derive
+from nerif.physics.medium import derive
 from nerif.reconstruction.aperture import apply_aperture
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.reconstructor import OnStep, Step, sampled
@@ -110,7 +110,7 @@ def finished_frame(plan: SequencePlan, field: NeuralField, measurement: Measurem
     """Return the volumes of a field, and its scores in the views."""
     grid = Grid.of_resolution(measurement.box, plan.settings.voxels)
     volume = sampled(field, grid, measurement.quantity, measurement.n_ambient, measurement.bodies, device)
-    volumes = [derive(volume, quantity, plan.settings.gas) for quantity in plan.settings.quantities]
+    volumes = [derive(volume, quantity, plan.settings.substance) for quantity in plan.settings.quantities]
     scores = _scores(plan.cold.model, field, apply_aperture(measurement, plan.cold.aperture), device)
     return Frame(field, volumes, scores, seconds=0.0, steps=0)
 

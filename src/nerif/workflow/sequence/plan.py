@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from nerif.common.conventions import InputError
-from nerif.common.settings import Count, Positive, check_settings
-from nerif.data.quantity_names import QUANTITIES, quantities_of
-from nerif.physics.quantities import GasSettings
+from nerif.common.settings import Count, Positive
+from nerif.data.quantity_names import INDEX, QUANTITIES
+from nerif.physics.media import MEDIA, MediumSettings
 from nerif.reconstruction.neural.neural import NeRIF
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ Event = Callable[[dict[str, object]], None]  #: called with {"frame", "what": "b
 
 
 @dataclass(frozen=True)
-class SequenceSettings:
+class SequenceSettings(MediumSettings):
     """Settings of a sequence in addition to those of the network; stored with the result."""
 
     chunk: Count = 32
@@ -38,30 +38,31 @@ class SequenceSettings:
     voxels: Count = 100
     """Voxels of the volumes along the longest edge of the box."""
     quantities: tuple[str, ...] = ()
-    """Volumes to write; of an index index_excess, n, density, temperature (default: the field, and density)."""
-    gas: GasSettings = field(default_factory=GasSettings)
-    """Gas for density and temperature."""
+    """Volumes to write; of an index index_excess, n, and those of the medium, such as density (default: the field, and
+    the first of the medium)."""
 
     def __post_init__(self) -> None:
-        check_settings(self)
+        super().__post_init__()
         for quantity in self.quantities:
             if quantity not in QUANTITIES:
                 raise InputError(f"expected some of {', '.join(QUANTITIES)}, got '{quantity}'", field="quantities")
 
     def for_measurement(self, measurement: Measurement) -> SequenceSettings:
-        """Return the settings with the quantities and the gas of a measurement."""
-        available, gas = quantities_of(measurement.quantity), self.gas.for_measurement(measurement)
-        other = gas.not_around(measurement.n_ambient) if "density" in available else ""
+        """Return the settings with the quantities and the medium of a measurement."""
+        medium = self.substance.for_measurement(measurement)
+        available = medium.available(measurement.quantity)
+        other = medium.not_around(measurement.n_ambient) if measurement.quantity == INDEX else ""
         for quantity in self.quantities:
             if quantity not in available:
                 names = " and ".join(kind.name for kind in measurement.techniques)
                 raise InputError(
                     f"expected some of {', '.join(available)} for {names}, got '{quantity}'", field="quantities"
                 )
-            if other and quantity in ("density", "temperature"):
+            if other and quantity in medium.names:
                 raise InputError(f"expected index_excess or n, got {quantity}: {other}", field="quantities")
-        default = (measurement.quantity,) if other else (measurement.quantity, "density")
-        return replace(self, quantities=self.quantities or tuple(q for q in available if q in default), gas=gas)
+        derived = [q for q in available if q in medium.names and not other]
+        default = (measurement.quantity, *derived[:1])
+        return replace(self.with_substance(medium), quantities=self.quantities or default)
 
 
 @dataclass(frozen=True)
@@ -83,4 +84,5 @@ class SequencePlan:
     @property
     def attributes(self) -> dict[str, Any]:
         """Attributes of the store, JSON; they must not change before the store is complete."""
-        return {"measurement": str(self.measurement), **asdict(self.settings), "settings": asdict(self.cold)}
+        entries = {k: v for k, v in asdict(self.settings).items() if k not in MEDIA} | self.settings.medium_entries
+        return {"measurement": str(self.measurement), **entries, "settings": asdict(self.cold)}

@@ -14,7 +14,7 @@ from nerif.common.interruption import if_interrupted
 from nerif.common.locks import locked
 from nerif.data.measurement import Measurement
 from nerif.data.measurement_sequence import MeasurementSequence
-from nerif.data.quantity_names import quantities_of
+from nerif.data.quantity_names import INDEX
 from nerif.geometry import Grid
 from nerif.reconstruction.aperture import apply_aperture
 from nerif.reconstruction.bounds import field_bounds
@@ -75,8 +75,8 @@ def reconstruct_sequence(
     like = apply_aperture(sequence.fullest(), reconstructor.aperture)
     like.without(settings.withhold)
     settings = settings.for_measurement(like)
-    if "density" in quantities_of(like.quantity) and (other := settings.gas.not_around(like.n_ambient)):
-        say(f"density: not computed: {other}")
+    if like.quantity == INDEX and (other := settings.substance.not_around(like.n_ambient)):
+        say(f"{settings.substance.names[0]}: not computed: {other}")
     network = reconstructor.resolved_by(like).network
     reconstructor = replace(reconstructor, network=network, wave_pixels=0, source="displacements")
     plan = SequencePlan(measurement.resolve(), out.resolve(), reconstructor, settings, threads)

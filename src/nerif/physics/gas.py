@@ -1,16 +1,18 @@
-"""n, density and temperature from the index excess."""
+"""A gas of one composition: density by Gladstone-Dale, temperature by the ideal gas law at a uniform pressure.
+
+rho = (n - 1) / K,      T = p M / (R rho)
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 
-from nerif.common.conventions import InputError, percent
-from nerif.data.quantity_names import QUANTITIES, quantities_of
+from nerif.data.quantity_names import INDEX
 from nerif.physics.gas_optics import (
     ambient_index,
     density_from_index,
@@ -19,6 +21,7 @@ from nerif.physics.gas_optics import (
     parse_mixture,
     temperature_from_density,
 )  # fmt: skip
+from nerif.physics.medium import Medium, check_pressure, check_wavelength
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -26,10 +29,9 @@ if TYPE_CHECKING:
     from nerif.data.measurement import Measurement
     from nerif.data.volume import Volume
 
-__all__ = ["NOT_UNIFORM", "GasChanges", "GasSettings", "derive", "derive_all", "deviation", "masked_lines"]
+__all__ = ["NOT_UNIFORM", "TEMPERATURE_RANGE", "GasChanges", "GasSettings"]
 
 TEMPERATURE_RANGE = 200.0, 4000.0  #: K; outside, gases of the table condense or dissociate
-LEAST_PRESSURE, LEAST_WAVELENGTH = 100.0, 100.0  # Pa and nm; smaller ones are in bar and µm
 AMBIENT_RANGE = 200.0, 2000.0  # K, of the gas around a flow
 HOTTEST = 2300.0  # K, of flames in air; helium in air appears as air of 2400 K
 PRODUCTS = "H2O", "CO2"  # a composition without them is not that of a flame
@@ -49,8 +51,12 @@ NOT_UNIFORM = (
 
 
 @dataclass(frozen=True)
-class GasSettings:
+class GasSettings(Medium):
     """Gas of density and temperature."""
+
+    names: ClassVar[tuple[str, ...]] = ("density", "temperature")
+    surface_names: ClassVar[tuple[str, ...]] = ("density",)
+    optional: ClassVar[tuple[str, ...]] = ("temperature",)
 
     composition: str = "air"
     """Gas or mixture by mole fractions, e.g. "CH4:0.11, air:0.89"; one composition is assumed throughout."""
@@ -63,25 +69,56 @@ class GasSettings:
     above and well below ambient, as behind compression and expansion waves."""
 
     def __post_init__(self) -> None:
-        if not 0 < self.pressure_pa < math.inf:
-            raise InputError(f"expected a positive pressure in Pa, got {self.pressure_pa}", field="pressure_pa")
-        if self.pressure_pa < LEAST_PRESSURE:
-            raise InputError(
-                f"expected Pa such as 101325, got {self.pressure_pa:g}; 1 bar are 100000 Pa", field="pressure_pa"
-            )
-        if self.wavelength_nm < LEAST_WAVELENGTH:
-            raise InputError(
-                f"expected nanometres such as 532, got {self.wavelength_nm:g}; 1 µm are 1000 nm", field="wavelength_nm"
-            )
+        check_pressure(self.pressure_pa, "pressure_pa")
+        check_wavelength(self.wavelength_nm)
 
     def for_measurement(self, measurement: Measurement) -> GasSettings:
         """Return the settings at the wavelength of a measurement, if it has one, and refuse invalid ones."""
-        if "density" not in quantities_of(measurement.quantity):
-            return self
-        wavelength = measurement.wavelength_nm
-        gas = self if wavelength is None else replace(self, wavelength_nm=wavelength)
-        gladstone_dale(gas.composition, gas.wavelength_nm)
+        gas = super().for_measurement(measurement)
+        if measurement.quantity == INDEX:
+            gladstone_dale(gas.composition, gas.wavelength_nm)
         return gas
+
+    def values(self, excess: Tensor, n_ambient: float, quantity: str) -> tuple[Tensor, str]:
+        density = density_from_index(excess, n_ambient, self._constant)
+        values, where = density.masked_fill(~(density > 0), math.nan), "n - 1 <= 0"
+        if quantity == "density":
+            return values, where
+        low, high = TEMPERATURE_RANGE
+        values = temperature_from_density(density, self.pressure_pa, molar_mass(self.composition))
+        values = values.masked_fill((values < low) | (values > high), math.nan)
+        return values, f"{where}, or temperature beyond {low:g} to {high:g} K"
+
+    def slope(self, excess: Tensor, n_ambient: float, quantity: str) -> Tensor:
+        """Return d rho / dn = 1 / K, or dT / dn = -T / (K rho)."""
+        if quantity == "density":
+            return excess.new_full(excess.shape, 1 / self._constant)
+        temperature = self.values(excess, n_ambient, "temperature")[0]
+        return -temperature / self._constant / density_from_index(excess, n_ambient, self._constant)
+
+    @property
+    def _constant(self) -> float:
+        return gladstone_dale(self.composition, self.wavelength_nm)
+
+    def attributes(self, quantity: str) -> dict[str, float | str]:
+        about: dict[str, float | str] = {
+            "gas": self.composition, "wavelength_nm": self.wavelength_nm, "gladstone_dale_m3_kg-1": self._constant,
+        }  # fmt: skip
+        if quantity == "temperature":
+            about |= {"pressure_pa": self.pressure_pa, "molar_mass_kg_mol-1": molar_mass(self.composition)}
+        return about
+
+    def assumption(self, quantity: str) -> str:
+        text = (
+            f"n - 1 = K rho (Gladstone-Dale) with K = {self._constant:.5g} m3/kg of {self.composition} at "
+            f"{self.wavelength_nm:g} nm, one composition throughout"
+        )
+        if quantity == "density":
+            return text
+        return (
+            f"T = p M / (R rho), an ideal gas of M = {molar_mass(self.composition) * 1e3:.4g} g/mol "
+            f"({self.composition}) at a uniform pressure of {self.pressure_pa:g} Pa; {text}"
+        )
 
     def not_around(self, n_ambient: float) -> str:
         """Return why the gas is not the medium around a flow, by the ambient index; empty if it may be."""
@@ -97,7 +134,7 @@ class GasSettings:
 
     def absent(self, excess: Volume) -> dict[str, str]:
         """Return the quantities that do not follow from a field of this gas, each with the reason."""
-        if "density" not in quantities_of(excess.quantity):
+        if excess.quantity != INDEX:
             return {}
         if reason := self.not_around(float(excess.attributes["n_ambient"])):
             return {"density": reason, "temperature": reason}
@@ -119,11 +156,7 @@ class GasSettings:
 
     def remarks(self, excess: Volume) -> list[str]:
         """Return lines on the quantities that do not follow from a field, and on what its temperature implies."""
-        absent = self.absent(excess)
-        lines = [
-            f"{' and '.join(q for q in absent if absent[q] == reason)}: not computed: {reason}"
-            for reason in dict.fromkeys(absent.values())
-        ]
+        lines = super().remarks(excess)
         if self._burnt or "temperature" not in self.quantities_of(excess):
             return lines
         _, _, *ends = self._ends(excess)
@@ -150,11 +183,6 @@ class GasSettings:
         cold, hot = temperature_from_density(density, self.pressure_pa, molar_mass(self.composition))
         return -float(low), float(high), float(cold), math.inf if math.isnan(hot) else float(hot)
 
-    def quantities_of(self, excess: Volume) -> tuple[str, ...]:
-        """Return the quantities of a field, without those that are absent."""
-        absent = self.absent(excess)
-        return tuple(q for q in quantities_of(excess.quantity) if q not in absent)
-
 
 @dataclass(frozen=True)
 class GasChanges:
@@ -174,89 +202,3 @@ class GasChanges:
         changes = {name: value for name, value in vars(self).items() if value is not None}
         stored = {name: value for name, value in settings.get("gas", {}).items() if name in vars(self)}
         return GasSettings(**stored | changes)
-
-
-def derive(excess: Volume, quantity: str, gas: GasSettings) -> Volume:
-    """Return n, density (Gladstone-Dale) or temperature (ideal gas) from a volume of index excess.
-
-        rho = (n - 1) / K,      T = p M / (R rho)
-
-    Values outside the relations (n - 1 <= 0, temperature outside 200 to 4000 K, everything that is absent from a field
-    of this gas) are NaN; the notes contain their number, the reason and the assumptions.
-
-    Parameters
-    ----------
-    excess : volume with n_ambient in its attributes
-    quantity : index_excess, n, density or temperature
-    """
-    from nerif.data.volume import Volume
-
-    quantities = quantities_of(excess.quantity)
-    if quantity not in quantities:
-        raise InputError(f"expected one of {', '.join(quantities)}, got '{quantity}'", field="quantity")
-    if quantity == excess.quantity:
-        return excess
-    n_ambient = float(excess.attributes["n_ambient"])
-    if quantity == "n":
-        return replace(excess, values=excess.values.double() + n_ambient, quantity="n")
-    k = gladstone_dale(gas.composition, gas.wavelength_nm)
-    attributes = excess.attributes | {
-        "gas": gas.composition, "wavelength_nm": gas.wavelength_nm, "gladstone_dale_m3_kg-1": k,
-    }  # fmt: skip
-    assumption = (
-        f"n - 1 = K rho (Gladstone-Dale) with K = {k:.5g} m3/kg of {gas.composition} at {gas.wavelength_nm:g} nm, "
-        "one composition throughout"
-    )
-    mass, (low, high) = molar_mass(gas.composition), TEMPERATURE_RANGE
-    if quantity == "temperature":
-        attributes |= {"pressure_pa": gas.pressure_pa, "molar_mass_kg_mol-1": mass}
-        assumption = (
-            f"T = p M / (R rho), an ideal gas of M = {mass * 1e3:.4g} g/mol ({gas.composition}) "
-            f"at a uniform pressure of {gas.pressure_pa:g} Pa; {assumption}"
-        )
-    if reason := gas.absent(excess).get(quantity):
-        values, where = excess.values.new_full(excess.values.shape, math.nan), reason
-    else:
-        density = density_from_index(excess.values.double(), n_ambient, k)
-        values, where = density.masked_fill(~(density > 0), math.nan), "n - 1 <= 0"
-        if quantity == "temperature":
-            values = temperature_from_density(density, gas.pressure_pa, mass)
-            values = values.masked_fill((values < low) | (values > high), math.nan)
-            where += f", or temperature beyond {low:g} to {high:g} K"
-    count, earlier = int(values.isnan().sum()), int(excess.notes.get("masked_voxels", 0))
-    if earlier:
-        where = f"{excess.notes['masked_where']}, or {where}" if count > earlier else str(excess.notes["masked_where"])
-    notes: dict[str, float | str] = {"assumption": assumption, "masked_voxels": count, "masked_where": where}
-    return Volume(values.float(), excess.grid, quantity, QUANTITIES[quantity][0], attributes, notes)
-
-
-def deviation(excess: Volume, std: Tensor, quantity: str, gas: GasSettings) -> Tensor:
-    """Return the standard deviation of n, density or temperature to first order; NaN where the quantity is.
-
-        std(n) = std,      std(rho) = std / K,      std(T) = T std(rho) / rho
-
-    Parameters
-    ----------
-    std : (z, y, x) standard deviation of the values of `excess`
-    """
-    if quantity in (excess.quantity, "n"):
-        return std
-    derived, density = derive(excess, quantity, gas), derive(excess, "density", gas)
-    of_density = std / float(derived.attributes["gladstone_dale_m3_kg-1"])
-    return of_density * derived.values.double() / density.values.double()
-
-
-def derive_all(excess: Volume, gas: GasSettings) -> list[Volume]:
-    """Return index_excess, n, and density and temperature where they follow; other quantities unchanged."""
-    return [derive(excess, quantity, gas) for quantity in gas.quantities_of(excess)]
-
-
-def masked_lines(volumes: list[Volume]) -> list[str]:
-    """Return a line with number and reason for each quantity with masked voxels."""
-    lines = []
-    for v in volumes:
-        count = int(v.notes.get("masked_voxels", 0))
-        if count:
-            share = f"{count} of {v.values.numel()} voxels ({percent(count / v.values.numel(), 2)})"
-            lines.append(f"{v.quantity}: {share} are NaN: {v.notes['masked_where']}")
-    return lines

@@ -1,0 +1,110 @@
+"""The media by name, and the choice of one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields, replace
+from typing import Any, Literal, Self
+
+from nerif.common.conventions import InputError
+from nerif.common.settings import check_settings
+from nerif.physics.gas import GasChanges, GasSettings
+from nerif.physics.isentropic import IsentropicSettings
+from nerif.physics.medium import Medium
+from nerif.physics.mixture import MixtureSettings
+from nerif.physics.plasma import PlasmaSettings
+from nerif.physics.table import TableSettings
+from nerif.physics.water import WaterSettings
+
+__all__ = ["MEDIA", "MediumChanges", "MediumSettings", "stored_medium"]
+
+MEDIA: Mapping[str, type[Medium]] = {
+    "gas": GasSettings, "mixture": MixtureSettings, "isentropic": IsentropicSettings, "water": WaterSettings,
+    "table": TableSettings, "plasma": PlasmaSettings,
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class MediumSettings:
+    """The medium that says what follows from the refractive index."""
+
+    medium: Literal[*MEDIA] = "gas"  # type: ignore[valid-type]
+    """Medium of the flow: gas (density, temperature), mixture (of two gases), isentropic (a wind tunnel), water, table
+    (another liquid), plasma (docs/media.md)."""
+    gas: GasSettings = field(default_factory=GasSettings)
+    """Gas for density and temperature."""
+    mixture: MixtureSettings = field(default_factory=MixtureSettings)
+    """Two gases that mix, for --medium mixture."""
+    isentropic: IsentropicSettings = field(default_factory=IsentropicSettings)
+    """Gas from a reservoir, for --medium isentropic."""
+    water: WaterSettings = field(default_factory=WaterSettings)
+    """Water, for --medium water."""
+    table: TableSettings = field(default_factory=TableSettings)
+    """A table of the index, for --medium table."""
+    plasma: PlasmaSettings = field(default_factory=PlasmaSettings)
+    """A plasma, for --medium plasma."""
+
+    def __post_init__(self) -> None:
+        check_settings(self)
+        for name, kind in MEDIA.items():
+            changed = [f.name for f in fields(kind) if getattr(getattr(self, name), f.name) != getattr(kind(), f.name)]
+            if name not in ("gas", self.medium) and changed:
+                option = f"--{name}.{changed[0].replace('_', '-')}"
+                raise InputError(f"expected {name} with {option}, got {self.medium}", field="medium")
+
+    @property
+    def substance(self) -> Medium:
+        """The medium with its settings."""
+        medium: Medium = getattr(self, self.medium)
+        return medium
+
+    def with_substance(self, medium: Medium) -> Self:
+        """Return the settings with others of the medium in use."""
+        changes: dict[str, Any] = {self.medium: medium}
+        return replace(self, **changes)
+
+    @property
+    def medium_entries(self) -> dict[str, Any]:
+        """Name and settings of the medium in use, for a file."""
+        name = {} if self.medium == "gas" else {"medium": self.medium}
+        return {**name, self.medium: asdict(self.substance)}
+
+
+@dataclass(frozen=True)
+class MediumChanges:
+    """The medium of a result, or another."""
+
+    medium: Literal["", *MEDIA] = ""  # type: ignore[valid-type]
+    """Medium of the flow; default: that of the result."""
+    gas: GasChanges = field(default_factory=GasChanges)
+    """Gas for density and temperature."""
+    mixture: MixtureSettings = field(default_factory=MixtureSettings)
+    """Two gases that mix, with --medium mixture."""
+    isentropic: IsentropicSettings = field(default_factory=IsentropicSettings)
+    """Gas from a reservoir, with --medium isentropic."""
+    water: WaterSettings = field(default_factory=WaterSettings)
+    """Water, with --medium water."""
+    table: TableSettings = field(default_factory=TableSettings)
+    """A table of the index, with --medium table."""
+    plasma: PlasmaSettings = field(default_factory=PlasmaSettings)
+    """A plasma, with --medium plasma."""
+
+    def of(self, settings: Mapping[str, Any]) -> Medium:
+        """Return the medium in the settings of a run (run.toml) with the changes."""
+        if self.medium and self.medium != "gas":
+            groups = {name: getattr(self, name) for name in MEDIA if name != "gas"}
+            return MediumSettings(medium=self.medium, **groups).substance
+        stored = stored_medium(settings)
+        if not self.medium and stored is not None and not isinstance(stored, GasSettings):
+            return stored
+        return self.gas.of(settings)
+
+
+def stored_medium(entries: Mapping[str, Any]) -> Medium | None:
+    """Return the medium in the settings of a run or the attributes of a film; None if they have none."""
+    name = str(entries.get("medium", "gas"))
+    if name not in MEDIA or name not in entries:
+        return None
+    kind = MEDIA[name]
+    names = {f.name for f in fields(kind)}
+    return kind(**{key: value for key, value in entries[name].items() if key in names})

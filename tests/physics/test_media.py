@@ -1,0 +1,233 @@
+"""Media against published values, closed relations and round trips."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import xarray as xr
+
+from commands import run
+from nerif.common.conventions import InputError
+from nerif.data.volume import Volume
+from nerif.geometry import Box, Grid
+from nerif.physics.gas_optics import ambient_index, gladstone_dale, molar_mass
+from nerif.physics.isentropic import IsentropicSettings
+from nerif.physics.media import MEDIA, MediumChanges, MediumSettings, stored_medium
+from nerif.physics.medium import Medium, derive, derive_all, deviation
+from nerif.physics.mixture import MixtureSettings
+from nerif.physics.plasma import PlasmaSettings, critical_density
+from nerif.physics.table import TableSettings
+from nerif.physics.two_wavelengths import gas_and_electrons, two_gases
+from nerif.physics.water import WaterSettings, fresh_water_index, seawater_index, water_density
+
+GRID = Grid(Box((-1, -1, -1), (1, 1, 1)), (2, 3, 4))
+N_AIR = 1.00027
+
+
+def volume(excess: object, n_ambient: float) -> Volume:
+    values = torch.as_tensor(excess, dtype=torch.float64).reshape(-1)
+    whole = torch.zeros(24, dtype=torch.float64)
+    whole[: len(values)] = values
+    return Volume.of(whole.reshape(GRID.shape), GRID, "index_excess", n_ambient)
+
+
+def values_of(medium: Medium, quantity: str, excess: object, n_ambient: float) -> np.ndarray:
+    return derive(volume(excess, n_ambient), quantity, medium).values.double().numpy().ravel()[: np.size(excess)]
+
+
+def test_helium_in_air_round_trip() -> None:
+    x = np.array([0.0, 0.25, 1.0])
+    indices = [ambient_index(f"He:{a}, air:{1 - a}", 293.15, 101325.0, 532.0) for a in x]
+    medium = MixtureSettings()
+    excess = np.array(indices) - indices[0]
+    np.testing.assert_allclose(values_of(medium, "mole_fraction", excess, indices[0]), x, atol=1e-6)
+    mass = x * molar_mass("He") / (x * molar_mass("He") + (1 - x) * molar_mass("air"))
+    np.testing.assert_allclose(values_of(medium, "mass_fraction", excess, indices[0]), mass, atol=1e-6)
+    density = values_of(medium, "density", excess, indices[0])
+    assert density[[0, 2]] == pytest.approx([1.2041, 0.16640], rel=1e-3)  # kg/m3, tables of both gases at 20 degrees C
+    assert np.isnan(values_of(medium, "mole_fraction", [-4e-4], indices[0]))[0]
+    with pytest.raises(InputError, match="does not separate them"):
+        MixtureSettings(jet="N2", ambient="air")
+    assert "not that of air" in medium.not_around(1.333)
+
+
+def test_tunnel_against_tables_of_isentropic_flow() -> None:
+    """NACA report 1135: at Mach 2, p/p0 = 0.1278, rho/rho0 = 0.2300, T/T0 = 0.5556; Mach 1: 0.5283, 0.6339, 0.8333."""
+    medium = IsentropicSettings(total_pressure_pa=2e5, total_temperature_k=300.0, mach=2.0)
+    k, rho0 = gladstone_dale("air", 532.0), medium.total_density
+    assert rho0 == pytest.approx(2e5 / 287.06 / 300, rel=1e-4)
+    n_ambient = 1 + k * 0.2300 * rho0
+    still = IsentropicSettings(total_pressure_pa=2e5, total_temperature_k=300.0)
+    assert still.stream_mach(n_ambient) == pytest.approx(2.0, abs=2e-3)
+    assert values_of(medium, "static_pressure", [0.0], n_ambient)[0] == pytest.approx(0.1278 * 2e5, rel=1e-3)
+    assert values_of(medium, "temperature", [0.0], n_ambient)[0] == pytest.approx(0.5556 * 300, rel=1e-3)
+    assert values_of(medium, "pressure_coefficient", [0.0], n_ambient)[0] == pytest.approx(0, abs=1e-3)
+    expansion = -k * (0.2300 - 0.0762) * rho0  # to Mach 3: 0.07623
+    assert values_of(medium, "mach", [expansion], n_ambient)[0] == pytest.approx(3.0, abs=5e-3)
+    compression = k * (0.6339 - 0.2300) * rho0
+    assert np.isnan(values_of(medium, "mach", [compression], n_ambient))[0]
+    assert np.isfinite(values_of(medium, "density", [compression], n_ambient))[0]
+
+
+def test_behind_a_shock_total_pressure_is_lost() -> None:
+    """Normal shock at Mach 2 (NACA 1135): rho2/rho1 = 2.6667, p2/p1 = 4.5, p02/p01 = 0.7209, M2 = 0.5774."""
+    medium = IsentropicSettings(mach=2.0, shock_angle=90.0)
+    k = gladstone_dale("air", 532.0)
+    stream = medium.stream_density(N_AIR)
+    excess, n_ambient = k * (2.6667 - 1) * stream, 1 + k * stream
+    assert values_of(medium, "mach", [excess], n_ambient)[0] == pytest.approx(0.5774, abs=2e-3)
+    ratio = values_of(medium, "static_pressure", [0.0, excess], n_ambient)
+    assert ratio[1] / ratio[0] == pytest.approx(4.5, rel=2e-3)
+    assert any("72.1%" in line for line in medium.remarks(volume([0.0], n_ambient)))
+    with pytest.raises(InputError, match=r"more than the Mach angle, 30.0 degrees"):
+        IsentropicSettings(mach=2.0, shock_angle=25.0)
+    low = IsentropicSettings(total_pressure_pa=2e4)
+    assert "above that of the reservoir" in low.not_around(N_AIR)
+    assert low.quantities_of(volume([0.0], N_AIR)) == ("index_excess", "n")
+
+
+def test_index_of_water() -> None:
+    """Check values of IAPWS R9-97 at 0 degrees C, 0.1 MPa; Tilton & Taylor 1938, sodium D, against air."""
+    checks = {226.5: 1.394527, 589.0: 1.334344, 1013.98: 1.326135}
+    for wavelength, expected in checks.items():
+        assert fresh_water_index(np.array([0.0]), wavelength)[0] == pytest.approx(expected, abs=2e-6)
+    table = {10: 1.33369, 20: 1.33299, 40: 1.33051, 60: 1.32718}
+    celsius = np.array([*table], dtype=float)
+    np.testing.assert_allclose(fresh_water_index(celsius, 589.3) / 1.000271, [*table.values()], atol=8e-5)
+    np.testing.assert_allclose(water_density(np.array([4.0, 25.0])), [999.972, 997.045], atol=0.01)
+    assert seawater_index(20.0, np.array([0.0]), 589.3)[0] == pytest.approx(1.33299, abs=5e-5)
+
+
+def test_heated_and_salted_water() -> None:
+    n = float(fresh_water_index(np.array([20.0]), 532.0)[0])
+    warm = fresh_water_index(np.array([25.0, 60.0]), 532.0) - n
+    medium = WaterSettings()
+    np.testing.assert_allclose(values_of(medium, "temperature", warm, 1.3335), [298.15, 333.15], atol=2e-3)
+    assert np.isnan(values_of(medium, "temperature", [0.05], 1.3335))[0]
+    salty = WaterSettings(varies="salinity", ambient_salinity=5.0)
+    steps = seawater_index(20.0, np.array([5.0, 12.0]), 532.0)
+    np.testing.assert_allclose(values_of(salty, "salinity", steps - steps[0], 1.334), [5.0, 12.0], atol=1e-3)
+    assert "salinity" not in medium.available("index_excess")
+    assert "not that of water" in medium.not_around(N_AIR)
+    with pytest.raises(InputError, match="expected 0 to 30 degrees C for salinity, got 50"):
+        WaterSettings(varies="salinity", ambient_c=50.0)
+
+
+def test_electrons_in_a_plasma() -> None:
+    """The critical density is 1.115e27 m^-3 at 1 um (Hutchinson), and n = 1 - n_e / (2 n_c) for small n_e."""
+    assert critical_density(1000.0) == pytest.approx(1.115e27, rel=1e-3)
+    n_e = 3e24
+    excess = -n_e / critical_density(532.0) / 2
+    assert values_of(PlasmaSettings(), "electron_density", [excess], 1.0)[0] == pytest.approx(n_e, rel=1e-3)
+
+
+def test_table_of_another_liquid(tmp_path: Path) -> None:
+    file = tmp_path / "ethanol.csv"
+    file.write_text(
+        "temperature [C],n,wavelength_nm\n" + "".join(
+            f"{t},{1.3616 - 4e-4 * (t - 20) + 2e-5 * (600 - w)},{w}\n" for w in (500, 600) for t in (10, 20, 30)
+        )
+    )  # fmt: skip
+    medium = TableSettings(file=file, ambient=20.0)
+    value = values_of(medium, "temperature", [-2e-3], 1.363)[0]
+    assert value == pytest.approx(298.15, abs=0.01)
+    assert medium.available("index_excess") == ("index_excess", "n", "temperature")
+    with pytest.raises(InputError, match=r"expected a value of the table \(283.15 to 303.15\), got 50"):
+        TableSettings(file=file, ambient=50.0)
+    with pytest.raises(InputError, match="expected 500 to 600 nm"):
+        TableSettings(file=file, ambient=20.0, wavelength_nm=632.8)
+    with pytest.raises(InputError, match="expected a file for --medium table"):
+        TableSettings().available("index_excess")
+
+
+@pytest.mark.parametrize("name", [name for name in MEDIA if name != "table"])
+def test_deviations_are_the_scatter_of_samples(name: str) -> None:
+    medium = MEDIA[name]()
+    n_ambient = {"water": 1.3345, "isentropic": 1.0002}.get(name, N_AIR)
+    centre = {"water": -2e-4, "mixture": -5e-5}.get(name, -1e-6)
+    std = 1e-6
+    field = volume(np.full(24, centre), n_ambient)
+    draws = centre + std * np.random.default_rng(0).standard_normal(4000)
+    for quantity in medium.available("index_excess")[2:]:
+        value = deviation(field, torch.full(GRID.shape, std, dtype=torch.float64), quantity, medium)
+        samples = medium.values(torch.from_numpy(draws), n_ambient, quantity)[0]
+        if quantity == "pressure_coefficient" and name == "isentropic":
+            assert bool(torch.isfinite(value).all())
+        assert float(value.mean()) == pytest.approx(float(samples.std()), rel=0.06)
+
+
+def test_a_medium_is_stored_and_read() -> None:
+    settings = MediumSettings(medium="water", water=WaterSettings(ambient_c=30.0))
+    assert stored_medium(settings.medium_entries) == settings.substance
+    assert MediumSettings().medium_entries.keys() == {"gas"}
+    assert MediumChanges().of(settings.medium_entries) == settings.substance
+    assert MediumChanges(medium="plasma").of(settings.medium_entries) == PlasmaSettings()
+    with pytest.raises(InputError, match=r"expected water with --water.ambient-c, got gas"):
+        MediumSettings(water=WaterSettings(ambient_c=30.0))
+    assert [v.quantity for v in derive_all(volume([0.0], 1.3345), settings.substance)] == [
+        "index_excess", "n", "temperature",
+    ]  # fmt: skip
+
+
+def test_a_run_in_water(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """From a measurement in a tank to temperature, its page, an export, and the medium of another export."""
+    path, out = tmp_path / "m.nc", tmp_path / "result"
+    assert not run(
+        "simulate", "--phantom", "gaussians", "--views", 4, "--image-size", 14, 14, "--n-ambient", 1.3345,
+        "--noise", 0.05, "--out", path,
+    )  # fmt: skip
+    words = ("--medium", "water", "--water.ambient-c", 25)
+    assert not run("reconstruct", path, "--out", out, "--max-steps", 30, "--withhold", "none", "--voxels", 12, *words)
+    result = xr.open_dataset(out / "volumes.nc") if (out / "volumes.nc").exists() else None
+    page = (out / "report.html").read_text(encoding="utf-8")
+    assert '"kind": "table"' in page or '"kind":"table"' in page
+    assert "temperature" in page
+    assert result is None or "density" not in result
+    assert not run("export", out, "--out", tmp_path / "t.nc", "--quantities", "temperature", "--voxels", 8)
+    with xr.open_dataset(tmp_path / "t.nc") as exported:
+        assert float(exported["temperature"].mean()) == pytest.approx(298.15, abs=5)
+    assert not run("export", out, "--out", tmp_path / "p.nc", "--medium", "plasma", "--voxels", 8)
+    capsys.readouterr()
+    assert run("export", out, "--out", tmp_path / "d.nc", "--quantities", "density", "--voxels", 8) == 2
+    assert "expected one of index_excess, n, temperature, got 'density'" in capsys.readouterr().err
+
+
+def test_two_wavelengths_separate_gas_and_electrons() -> None:
+    rho, n_e, lights = -0.3, 5e23, (532.0, 1064.0)
+    k = [gladstone_dale("air", w) for w in lights]
+    excess = [a * rho - n_e / critical_density(w) / 2 for a, w in zip(k, lights, strict=True)]
+    fields = [volume(np.full(24, x), N_AIR) for x in excess]
+    stds = [torch.full(GRID.shape, 1e-7)] * 2
+    density, electrons, *deviations = gas_and_electrons(fields, lights, stds=stds)
+    assert float(density.values.mean()) == pytest.approx(rho, rel=1e-5)
+    assert float(electrons.values.mean()) == pytest.approx(n_e, rel=1e-5)
+    assert [v.quantity for v in deviations] == ["density_std", "electron_density_std"]
+    one = 1e-7 * 2 * critical_density(1064.0)  # by one wavelength, if the gas were known
+    assert one < float(deviations[1].values.mean()) < 2 * one
+    with pytest.raises(InputError, match="the same relation twice"):
+        gas_and_electrons(fields, (532.0, 532.0))
+
+
+def test_two_wavelengths_give_temperature_and_composition_with_deviations_that_say_how_badly() -> None:
+    lights, x, hot = (500.0, 650.0), 0.4, 500.0
+    mixed = {w: ambient_index(f"He:{x}, air:{1 - x}", hot, 101325.0, w) for w in lights}
+    still = {w: ambient_index("air", 293.15, 101325.0, w) for w in lights}
+    excess = [mixed[w] - still[w] for w in lights]
+    fields = [volume(np.full(24, e), N_AIR) for e in excess]
+    std = 1e-9
+    temperature, fraction, *deviations = two_gases(
+        fields, lights, "He", "air", stds=[torch.full(GRID.shape, std)] * 2
+    )  # fmt: skip
+    assert float(temperature.values.mean()) == pytest.approx(hot, rel=1e-3)
+    assert float(fraction.values.mean()) == pytest.approx(x, rel=1e-3)
+    draws = np.random.default_rng(0).standard_normal((2, 24)) * std
+    noisy = [volume(e + d, N_AIR) for e, d in zip(excess, draws, strict=True)]
+    scatter = two_gases(noisy, lights, "He", "air")
+    for samples, deviation_of in zip(scatter, deviations, strict=True):
+        assert float(deviation_of.values.mean()) == pytest.approx(float(samples.values.std()), rel=0.4)
+    assert (
+        float(deviations[1].values.mean()) > 0.001
+    )  # a billionth of the index is already a thousandth of the fraction
