@@ -17,6 +17,10 @@ pose_sigma = [rx, ry, rz, cx, cy, cz]   # optional: standard deviations of rotat
 [camera.background]                     # optional: normal . x = offset
 normal = [nx, ny, nz]
 offset = -500.0                         # mm
+[[camera.interface]]                    # optional: up to three planes, in order from the camera
+normal = [nx, ny, nz]                   # unit vector: normal . x = offset
+offset = 300.0                          # mm
+index = 1.52                            # refractive index behind the plane
 """
 
 from __future__ import annotations
@@ -36,18 +40,19 @@ from torch import Tensor
 from nerif.common.arrays import Matrix3
 from nerif.common.conventions import InputError, check_name, within
 from nerif.common.files import check_known, read_toml, write_toml
-from nerif.geometry import PERSPECTIVE, Box, Camera, Lens, Plane, Projection, projection_named
+from nerif.geometry import PERSPECTIVE, Box, Camera, Interface, Lens, Plane, Projection, projection_named
 from nerif.geometry.distortion import UPRIGHT
 
 __all__ = [
     "FORMAT", "CalibratedCamera", "check_camera", "check_distortion", "check_model", "check_names",
-    "check_program", "flat", "numbers", "read_box", "read_cameras", "write_cameras",
+    "check_program", "flat", "interface_of", "numbers", "read_box", "read_cameras", "write_cameras",
 ]  # fmt: skip
 
 FORMAT = "nerif-calibration-1"
 ARRAYS = ("intrinsics", "distortion", "rotation", "translation")
 LENS = ("aperture_diameter", "focus_distance")
-KEYS = ("name", "projection", "image_size", *ARRAYS, "tilt", "background", *LENS, "pose_sigma")
+KEYS = ("name", "projection", "image_size", *ARRAYS, "tilt", "background", *LENS, "pose_sigma", "interface")
+INTERFACE = ("normal", "offset", "index")
 BROWN = (
     "brown", "opencv", "perspective", "pinhole", "plumb_bob", "radial", "radtan", "simple_pinhole", "simple_radial",
 )  # fmt: skip
@@ -73,6 +78,7 @@ class CalibratedCamera:
     lens: Lens | None = None
     pose_sigma: Float[Tensor, 6] | None = None
     tilt: Float[Tensor, 2] = UPRIGHT
+    interfaces: tuple[Interface, ...] = ()
 
     def camera(self, image_size: tuple[int, int] | None = None, background: Plane | None = None) -> Camera:
         """Return the Camera, with this image size (px) and background where they are given."""
@@ -99,7 +105,7 @@ class CalibratedCamera:
     def from_values(
         cls, where: str, name: str, intrinsics: Any, rotation: Any, translation: Any, distortion: Any = None,
         image_size: Any = None, background: tuple[Any, Any] | None = None, projection: Any = PERSPECTIVE.name,
-        lens: Lens | None = None, pose_sigma: Any = None, tilt: Any = None,
+        lens: Lens | None = None, pose_sigma: Any = None, tilt: Any = None, interfaces: tuple[Interface, ...] = (),
     ) -> CalibratedCamera:  # fmt: skip
         """Return a camera from the numbers of a file, after checking their shapes; errors start with `where`.
 
@@ -128,7 +134,18 @@ class CalibratedCamera:
             lens=lens,
             pose_sigma=None if pose_sigma is None else numbers(pose_sigma, (6,), f"{where}: pose_sigma"),
             tilt=last if tilt is None else numbers(tilt, (2,), f"{where}: tilt"),
+            interfaces=interfaces,
         )
+
+
+def interface_of(table: Any, where: str) -> Interface:
+    """Return the interface of a table with normal, offset (mm) and index, after checking it."""
+    if not isinstance(table, dict) or set(table) != set(INTERFACE):
+        got = sorted(table) if isinstance(table, dict) else table
+        raise InputError(f"expected normal = [x, y, z], offset = mm and index, got {got}", field=where)
+    offset, index = (float(numbers(table[key], (), f"{where}: {key}")) for key in INTERFACE[1:])
+    with within(where):
+        return Interface(numbers(table["normal"], (3,), f"{where}: normal"), offset, index)
 
 
 def check_camera(camera: CalibratedCamera, source: str) -> CalibratedCamera:
@@ -273,6 +290,9 @@ def write_cameras(
             table["pose_sigma"] = camera.pose_sigma.tolist()
         if camera.background is not None:
             table["background"] = {"normal": camera.background.normal.tolist(), "offset": camera.background.offset}
+        if camera.interfaces:
+            planes = camera.interfaces
+            table["interface"] = [{"normal": p.normal.tolist(), "offset": p.offset, "index": p.index} for p in planes]
         tables.append(table)
     corners = {"box": [list(box.lower), list(box.upper)]} if box else {}
     write_toml(path, {"format": FORMAT, **corners, "camera": tables, **({"about": about} if about else {})})
@@ -308,13 +328,17 @@ def _camera(table: dict[str, Any], index: int, path: str) -> CalibratedCamera:
     for key in ("name", "intrinsics", "rotation", "translation"):
         if key not in table:
             raise InputError(f"'{key}' is missing", field=where)
-    values = {key: table[key] for key in table if key not in LENS}
+    values = {key: table[key] for key in table if key not in (*LENS, "interface")}
     values |= {"name": str(table["name"]), "lens": _lens(table, where)}
     plane = table.get("background")
     if plane is not None:
         if not isinstance(plane, dict) or set(plane) != {"normal", "offset"}:
             raise InputError(f"background: expected normal = [x, y, z] and offset = mm, got {plane!r}", field=where)
         values["background"] = plane["normal"], plane["offset"]
+    planes = table.get("interface", [])
+    if not isinstance(planes, list):
+        raise InputError(f"interface: expected tables [[camera.interface]], got {planes!r}", field=where)
+    values["interfaces"] = tuple(interface_of(p, f"{where}: interface {i + 1}") for i, p in enumerate(planes))
     return check_camera(CalibratedCamera.from_values(where, **values), path)
 
 

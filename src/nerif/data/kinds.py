@@ -28,8 +28,8 @@ __all__ = [
     "check_kind", "kind_of", "known_conventions", "reading_as",
 ]  # fmt: skip
 
-BOST = ("BOST-1.0", "BOST-1.1", "BOST-1.2")
-"""Attribute Conventions of measurements: with the content of version 1.0, with more, and with bodies."""
+BOST = ("BOST-1.0", "BOST-1.1", "BOST-1.2", "BOST-1.3")
+"""Attribute Conventions of measurements: with the content of version 1.0, with more, with bodies, with interfaces."""
 RUN, FIELD = "run.toml", "field.safetensors"
 """Settings and field of a result directory."""
 SEQUENCE_KIND = "nerif sequence 1"

@@ -19,7 +19,7 @@ from nerif.forward.forward_model import ForwardModel
 from nerif.forward.registry import TECHNIQUES, forward_model
 from nerif.geometry import Box, Camera, Rays
 from nerif.geometry.body import Body
-from nerif.geometry.plausibility import background_cuts, likely_cause, rays_on_lattice
+from nerif.geometry.plausibility import background_cuts, interface_cuts, likely_cause, rays_on_lattice
 from nerif.geometry.region import Region, check_region
 
 __all__ = ["MASKS", "MeasurementData", "Observation", "arguments_of", "integrals_of"]
@@ -27,6 +27,7 @@ __all__ = ["MASKS", "MeasurementData", "Observation", "arguments_of", "integrals
 MASKS = ("valid", "flow_mask", "hidden")
 """Fields of a measurement that are masks (view, row, column)."""
 WAVELENGTHS_NM = (100.0, 30000.0)  # ultraviolet to thermal infrared
+INDEX_TOLERANCE = 0.01  # of n_ambient, from the index behind the last interface
 PIXELS_AT_A_TIME = 1 << 17  # whose rays are traced together
 Data = TypeVar("Data", bound="MeasurementData")
 
@@ -282,6 +283,7 @@ class MeasurementData:
         crossing = False
         for camera in self.cameras:
             camera.check_distortion()
+            self._check_interfaces(camera)
             rays = rays_on_lattice(camera, self.box)
             crossing |= bool(rays.crosses.any())
             if background_cuts(camera, self.box, rays):
@@ -296,6 +298,24 @@ class MeasurementData:
                 f"no ray crosses it ({self.box.lower} to {self.box.upper} mm); check the box, and that rotation and "
                 "translation map world to camera; " + likely_cause(self.cameras, self.box),
                 field="box",
+            )
+
+    def _check_interfaces(self, camera: Camera) -> None:
+        """Check that interfaces are in front of the box and lead into the medium around the flow."""
+        if not camera.interfaces:
+            return
+        if interface_cuts(camera, self.box):
+            raise InputError(
+                "expected planes between the camera and the box, got one that cuts the box or lies behind it; check "
+                "normal, offset (mm) and box",
+                field=f"interfaces of view '{camera.name}'",
+            )
+        index = camera.interfaces[-1].index
+        if self.quantity == "index_excess" and abs(index / self.n_ambient - 1) > INDEX_TOLERANCE:
+            raise InputError(
+                f"expected n_ambient = {self.n_ambient:g} behind the last plane, got {index:g}; give n_ambient of the "
+                "medium around the flow, or the plane between glass and medium",
+                field=f"interfaces of view '{camera.name}'",
             )
 
     @property

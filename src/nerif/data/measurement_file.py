@@ -1,4 +1,4 @@
-"""The file of a measurement: NetCDF-4, Conventions BOST-1.0 to 1.2 (docs/formats.md).
+"""The file of a measurement: NetCDF-4, Conventions BOST-1.0 to 1.3 (docs/formats.md).
 
 Each map of a technique is a variable on view, row, column (and component); the others describe the rig.
 """
@@ -24,7 +24,7 @@ from nerif.forward.deflection import Deflection
 from nerif.forward.forward_model import ForwardModel
 from nerif.forward.images import Images
 from nerif.forward.registry import TECHNIQUES, technique
-from nerif.geometry import PERSPECTIVE, Box, Camera, Lens, Plane, Projection, projection_named
+from nerif.geometry import PERSPECTIVE, Box, Camera, Interface, Lens, Plane, Projection, projection_named
 from nerif.geometry.body import Body
 from nerif.geometry.region import Region
 
@@ -35,7 +35,7 @@ __all__ = [
     "BODIES", "CONVENTIONS", "PLAIN", "bodies_of", "encoding", "from_dataset", "map_names", "to_dataset", "variables",
 ]  # fmt: skip
 
-PLAIN, CONVENTIONS, WITH_BODIES = BOST
+PLAIN, CONVENTIONS, WITH_BODIES, WITH_INTERFACES = BOST
 
 PIXELS = ("view", "row", "column")
 RIG = {
@@ -56,6 +56,9 @@ RIG = {
     "window": (("view",), "px"),
     "pose_sigma": (("view", "parameter"), "rad rad rad mm mm mm"),
     "frame_offset": (("view",), "1"),
+    "interface_normal": (("view", "interface", "i"), "1"),
+    "interface_offset": (("view", "interface"), "mm"),
+    "interface_index": (("view", "interface"), "1"),
     "body_vertices": (("body_vertex", "i"), "mm"),
     "body_faces": (("body_face", "body_corner"), "1"),
     "body_of_face": (("body_face",), "1"),
@@ -66,6 +69,7 @@ RIG = {
 BODIES = tuple(name for name in RIG if name.startswith("body_"))
 REQUIRED = ("intrinsics", "rotation", "translation", "box")
 BACKGROUND = ("background_normal", "background_offset")
+INTERFACE = ("interface_normal", "interface_offset", "interface_index")
 SIZES = {"i": 3, "j": 3, "coefficient": 5, "axis": 2, "corner": 2, "side": 2, "parameter": 6, "body_corner": 3}
 SPELLINGS = {"px/mm": "px mm-1"}
 ROTATION = 1e-4  # of a product of orthonormal columns, from 0 and 1
@@ -148,6 +152,7 @@ def to_dataset(measurement: MeasurementData) -> xr.Dataset:
     frame_offsets = np.array([measurement.frame_offsets.get(name, 0) for name in measurement.names], dtype=np.int32)
     if frame_offsets.any():
         data["frame_offset"] = frame_offsets
+    data |= _planes_between(cameras)
     data |= _meshes(measurement.bodies)
     for name, value in {**measurement.all_maps, **{name: getattr(measurement, name) for name in MASKS}}.items():
         if value is not None:
@@ -166,8 +171,11 @@ def to_dataset(measurement: MeasurementData) -> xr.Dataset:
     with_bodies = bool(data.keys() & {"hidden", "body_vertices"})
     with_bodies |= measurement.ambient_region is not None
     plain &= not with_bodies
+    version = WITH_BODIES if with_bodies else CONVENTIONS
+    if INTERFACE[0] in data:
+        plain, version = False, WITH_INTERFACES
     dataset.attrs = {
-        "Conventions": PLAIN if plain else WITH_BODIES if with_bodies else CONVENTIONS,
+        "Conventions": PLAIN if plain else version,
         **({} if plain else {"technique": " ".join(names)}),
         "n_ambient": measurement.n_ambient,
         "ambient_faces": " ".join(measurement.ambient_faces),
@@ -230,6 +238,35 @@ def _region(text: str) -> Region:
             f"expected a text such as 'box -5 5 -5 5 -20 -15' (mm), got {text!r}", field="attribute ambient_region"
         ) from None
     return (x0, x1, y0, y1, z0, z1)
+
+
+def _planes_between(cameras: Sequence[Camera]) -> dict[str, np.ndarray]:
+    """Return the variables of interfaces, NaN where a view has fewer than others; none without interfaces."""
+    most = max(len(c.interfaces) for c in cameras)
+    if not most:
+        return {}
+    table = np.full((len(cameras), most, 5), np.nan)
+    for i, camera in enumerate(cameras):
+        for j, plane in enumerate(camera.interfaces):
+            table[i, j] = [*plane.normal.tolist(), plane.offset, plane.index]
+    return dict(zip(INTERFACE, (table[..., :3], table[..., 3], table[..., 4]), strict=True))
+
+
+def _interfaces(dataset: xr.Dataset, names: list[str]) -> list[tuple[Interface, ...]]:
+    """Return the interfaces of all views."""
+    present = [name for name in INTERFACE if name in dataset]
+    if not present:
+        return [()] * len(names)
+    if len(present) < len(INTERFACE):
+        missing = next(name for name in INTERFACE if name not in present)
+        raise InputError(f"expected beside {present[0]}, got none", field=f"variable '{missing}'")
+    normals, offsets, indices = (_array(dataset, name, gaps=True) for name in INTERFACE)
+    planes = []
+    for name, *table in zip(names, normals, offsets.tolist(), indices.tolist(), strict=True):
+        with within(f"view '{name}'"):
+            rows = [row for row in zip(*table, strict=True) if not math.isnan(row[2])]
+            planes.append(tuple(Interface(*row) for row in rows))
+    return planes
 
 
 def _meshes(bodies: tuple[Body, ...]) -> dict[str, np.ndarray]:
@@ -405,7 +442,7 @@ def _cameras(dataset: xr.Dataset) -> tuple[Camera, ...]:
     normals = _optional(dataset, "background_normal", (views, 3))
     offsets = _optional(dataset, "background_offset", (views,))
     pose_sigma = _optional(dataset, "pose_sigma", (views, 6))
-    lenses = _lenses(dataset, names)
+    lenses, interfaces = _lenses(dataset, names), _interfaces(dataset, names)
     cameras = []
     for i, name in enumerate(names):
         height, width = (whole(edge, f"image_size of view '{name}'") for edge in sizes[i].tolist())
@@ -422,6 +459,7 @@ def _cameras(dataset: xr.Dataset) -> tuple[Camera, ...]:
                 lens=lenses[i],
                 pose_sigma=None if bool(pose_sigma[i].isnan().all()) else pose_sigma[i],
                 tilt=tilt[i],
+                interfaces=interfaces[i],
             )
         )
     return tuple(cameras)

@@ -4,6 +4,7 @@ from .camera import Camera as Camera
 from .camera import Plane as Plane
 from .grid import Box as Box
 from .grid import Grid as Grid
+from .interfaces import Interface as Interface
 from .lens import Lens as Lens
 from .lens import LensDiscs as LensDiscs
 from .lens import spread_points as spread_points

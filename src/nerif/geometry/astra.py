@@ -67,8 +67,10 @@ def astra_of(cameras: Sequence[Camera], size: tuple[int, int], grid: Grid) -> di
 
 
 def check_vectors(cameras: Sequence[Camera]) -> None:
-    """Refuse cameras with distortion, whose pixels do not lie on a plane in equal steps."""
+    """Refuse cameras with distortion or interfaces, whose pixels do not lie on a plane in equal steps."""
     for camera in cameras:
+        if camera.interfaces:
+            raise InputError("expected none, which vectors cannot hold", field=f"interfaces of view '{camera.name}'")
         if bool(camera.distortion.any()):
             raise InputError(
                 f"expected none, which vectors cannot hold, got {camera.distortion.tolist()}; undistort the images and "

@@ -5,7 +5,8 @@
     perspective    (x, y) = (X/Z, Y/Z)    rays through the optical centre; K holds focal lengths, px
     telecentric    (x, y) = (X, Y)        rays parallel to the optical axis; K holds px per mm
 
-with (x_t, y_t) of (x, y) by distortion and tilt (distortion.py). Conventions of OpenCV.
+with (x_t, y_t) of (x, y) by distortion and tilt (distortion.py). Conventions of OpenCV. Windows between the camera and
+the flow bend the rays (interfaces.py); a ray then is its part behind the last of them.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from torch import Tensor
 from nerif.common.arrays import Matrix3, Pixels, Points, Values, make_tensors
 from nerif.common.conventions import LARGEST_LENGTH, InputError, check_name
 from nerif.geometry.distortion import UPRIGHT, from_sensor, to_sensor
+from nerif.geometry.interfaces import MAX_INTERFACES, Interface, Line, image_of
 from nerif.geometry.lens import Lens, LensDiscs
 from nerif.geometry.projection import MAX_TILT, PERSPECTIVE, Projection
 from nerif.geometry.rays import BackgroundPoints, Rays
@@ -59,6 +61,8 @@ class Camera:
     tilt: Float[Tensor, 2] = UPRIGHT
     """OpenCV's tau_x, tau_y of the sensor behind a Scheimpflug lens, rad; of a perspective camera only, since
     for parallel rays fx, fy and skew describe it."""
+    interfaces: tuple[Interface, ...] = ()
+    """Planes at which rays are refracted between the camera and the flow, in order from the camera."""
 
     def __post_init__(self) -> None:
         def check(name: str, valid: bool, expected: str, got: object, remedy: str = "") -> None:
@@ -96,6 +100,12 @@ class Camera:
         remedy = "; remove it, since fx, fy and skew describe a tilted sensor where rays are parallel"
         valid = kind.shows_depth or not bool(self.tilt.any())
         check("tilt", valid, f"none for a {kind.name} camera", self.tilt.tolist(), remedy)
+        valid = len(self.interfaces) <= MAX_INTERFACES
+        check("interfaces", valid, f"at most {MAX_INTERFACES} planes", len(self.interfaces))
+        remedy = "; nerif does not refract the cone of rays of a lens: leave the aperture out"
+        valid = not (self.interfaces and lens is not None and lens.diameter > 0)
+        got = "" if lens is None else f"{lens.diameter:g} mm"
+        check("aperture_diameter", valid, "thin rays (0) through interfaces", got, remedy)
         valid = min(self.image_size) > 0 and max(self.image_size) <= MAX_IMAGE_EDGE
         check("image_size", valid, f"(height, width) between 1 and {MAX_IMAGE_EDGE} px", self.image_size)
         if (sigma := self.pose_sigma) is not None:
@@ -122,6 +132,8 @@ class Camera:
 
     def sight(self, points: Points) -> Points:
         """Return the unit directions of the lines of sight through world points (mm), away from the camera."""
+        if self.interfaces:
+            return self._line(self._image(points)).direction
         return self.projection.sight(self.local(points)) @ self.rotation
 
     def distance(self, points: Points) -> Values:
@@ -130,6 +142,9 @@ class Camera:
 
     def pixel_size(self, points: Points) -> Values:
         """Return the width of a pixel at world points (mm), across the axis, mm; without distortion and tilt."""
+        if self.interfaces:
+            slope = self._line(self._image(points)).image_slope(points)[..., 0, :]
+            return 1 / (self.intrinsics[0, 0] * (slope @ self.rotation[0]))
         return 1 / (self.intrinsics[0, 0] * self.projection.magnification(self.local(points)))
 
     @property
@@ -148,15 +163,25 @@ class Camera:
 
     @property
     def unseen(self) -> float:
-        """Fraction of the image in which the distortion cannot be inverted, from LATTICE x LATTICE of its pixels."""
+        """Fraction of the image without rays, from LATTICE x LATTICE of its pixels.
+
+        There the distortion cannot be inverted, or interfaces reflect the rays totally.
+        """
         height, width = self.image_size
         u, v = (torch.linspace(0, n - 1, min(n, LATTICE), dtype=torch.float64) for n in (width, height))
         rays = self.rays(torch.cartesian_prod(u, v).reshape(-1, 2), sensitivity=False)
         return 1 - float((rays.origin + rays.direction).isfinite().all(dim=-1).double().mean())
 
     def check_distortion(self) -> None:
-        """Refuse a distortion that cannot be inverted over most of the image."""
-        if self.unseen > 0.5:
+        """Refuse a distortion that cannot be inverted, or interfaces that block the rays, over most of the image."""
+        unseen = self.unseen
+        if unseen > 0.5 and self.interfaces and replace(self, interfaces=()).unseen <= 0.5:
+            raise InputError(
+                "expected planes in front of the camera in the order in which its rays cross them, got total reflection "
+                f"or another order over {unseen:.0%} of the image",
+                field=f"interfaces of view '{self.name}'",
+            )
+        if unseen > 0.5:
             raise InputError(
                 f"expected coefficients that can be inverted over the image, "
                 f"got {self.distortion.tolist()}; check their order (k1, k2, p1, p2, k3)",
@@ -164,13 +189,19 @@ class Camera:
             )
 
     def project(self, points: Points) -> Pixels:
-        """Return the pixels (px) of world points (mm); NaN beyond the fold of the distortion."""
+        """Return the pixels (px) of world points (mm); NaN beyond the fold of the distortion, and at total reflection.
+
+        Through interfaces the ray is found by Newton's method.
+        """
         return self._project_jacobian(points)[0]
 
     def rays(self, pixels: Float[Tensor, "n 2"], sensitivity: bool = True, view: int = 0) -> Rays:
         """Return the rays of `pixels` (px), back-traced to the background; not yet clipped to a box.
 
-        A pixel at which the distortion cannot be inverted has a ray of NaN, which crosses no box.
+        A pixel at which the distortion cannot be inverted, or interfaces reflect the ray totally, has a ray of NaN,
+        which crosses no box. Through interfaces, origin and direction are those of the part behind the last of them,
+        which begins there (`begin`); the origin is the apparent optical centre, where rays of neighbouring pixels are
+        closest.
 
         Parameters
         ----------
@@ -181,15 +212,19 @@ class Camera:
         y = (pixels[..., 1] - k[1, 2]) / k[1, 1]
         x = (pixels[..., 0] - k[0, 2] - k[0, 1] * y) / k[0, 0]
         ideal = from_sensor(torch.stack([x, y], dim=-1), self.distortion, self.tilt)
-        start, heading = self.projection.lines(ideal)
-        direction = heading @ self.rotation
-        direction = direction / direction.norm(dim=-1, keepdim=True)
-        origin = (self.centre + start @ self.rotation).expand_as(direction)
         zero = torch.zeros_like(pixels[..., 0])
+        if self.interfaces:
+            line = self._line(ideal)
+            origin, direction, begin = line.origin + line.begin[..., None] * line.direction, line.direction, -line.begin
+        else:
+            start, heading = self.projection.lines(ideal)
+            direction = heading @ self.rotation
+            direction = direction / direction.norm(dim=-1, keepdim=True)
+            origin = (self.centre + start @ self.rotation).expand_as(direction)
+            begin = torch.full_like(zero, self.projection.begin)
         number = torch.full(zero.shape, view, dtype=torch.int16)
-        ends = self._background_points(origin, direction, sensitivity)
+        ends = self._background_points(origin, direction, sensitivity, ideal)
         lens = self._lens_discs(direction, ends)
-        begin = torch.full_like(zero, self.projection.begin)
         return Rays(origin, direction, zero, zero, pixels, number, begin, ends, lens)
 
     def depth(self, plane: Plane) -> float:
@@ -242,14 +277,17 @@ class Camera:
         parallel = torch.full_like(focus, not self.projection.shows_depth, dtype=torch.bool)
         return LensDiscs(axis.expand_as(direction), normal.expand_as(direction), radius, focus, window, parallel)
 
-    def _background_points(self, origin: Points, direction: Points, sensitivity: bool) -> BackgroundPoints | None:
+    def _background_points(
+        self, origin: Points, direction: Points, sensitivity: bool, image: Pixels
+    ) -> BackgroundPoints | None:
         if self.background is None:
             return None
         normal = self.background.normal.to(direction)
         distance = (self.background.offset - origin @ normal) / (direction @ normal)
         if not sensitivity:
             return BackgroundPoints(torch.zeros_like(distance)[:, None, None].expand(-1, 2, 3), distance)
-        return BackgroundPoints(-self._project_jacobian(origin + distance[..., None] * direction)[1], distance)
+        end = origin + distance[..., None] * direction
+        return BackgroundPoints(-self._project_jacobian(end, image if self.interfaces else None)[1], distance)
 
     def view(self, row: int, column: int, height: int, width: int) -> Camera:
         """Return the camera of a crop of its image from (row, column), px."""
@@ -257,14 +295,33 @@ class Camera:
         shift[0, 2], shift[1, 2] = column, row
         return replace(self, intrinsics=self.intrinsics - shift, image_size=(height, width))
 
-    def _project_jacobian(self, points: Points) -> tuple[Pixels, Float[Tensor, "*batch 2 3"]]:
-        """Pixels and d pixel / d X (px/mm)."""
+    def _line(self, image: Pixels) -> Line:
+        """Lines of sight at the image (x, y) behind the interfaces."""
+        start, heading = self.projection.lines(image)
+        zero, unit = (self.projection.lines(x) for x in (image.new_zeros(1, 2), torch.eye(2, dtype=image.dtype)))
+        slopes = [(there - here) @ self.rotation for there, here in zip(unit, zero, strict=True)]
+        origin = self.centre + (start @ self.rotation).expand_as(heading)
+        line = Line.of(origin, heading @ self.rotation, slopes[0].expand(2, 3), slopes[1])
+        return line.behind(self.interfaces, self.projection.shows_depth)
+
+    def _image(self, points: Points) -> Pixels:
+        """The image (x, y) of world points through the interfaces."""
+        return image_of(points, self._line, self.projection.image(self.local(points)))
+
+    def _project_jacobian(
+        self, points: Points, image: Pixels | None = None
+    ) -> tuple[Pixels, Float[Tensor, "*batch 2 3"]]:
+        """Pixels and d pixel / d X (px/mm); with `image` where (x, y) is available."""
         local = self.local(points)
-        image, slope = self.projection.image(local), self.projection.slope
+        if image is None:
+            image = self._image(points) if self.interfaces else self.projection.image(local)
         x, y, (xx, xy, yx, yy) = to_sensor(image, self.distortion, self.tilt)
         k = self.intrinsics
         pixels = torch.stack([k[0, 0] * x + k[0, 1] * y + k[0, 2], k[1, 1] * y + k[1, 2]], dim=-1)
+        u, v = (k[0, 0] * xx + k[0, 1] * yx, k[0, 0] * xy + k[0, 1] * yy), (k[1, 1] * yx, k[1, 1] * yy)
+        if self.interfaces:
+            by_x, by_y = self._line(image).image_slope(points).unbind(-2)
+            return pixels, torch.stack([w[0][..., None] * by_x + w[1][..., None] * by_y for w in (u, v)], dim=-2)
         # row by row: small matrix products are slow in a batch
-        u = slope(k[0, 0] * xx + k[0, 1] * yx, k[0, 0] * xy + k[0, 1] * yy, image, local)
-        v = slope(k[1, 1] * yx, k[1, 1] * yy, image, local)
-        return pixels, torch.stack([*u, *v], dim=-1).unflatten(-1, (2, 3)) @ self.rotation
+        rows = [*self.projection.slope(*u, image, local), *self.projection.slope(*v, image, local)]
+        return pixels, torch.stack(rows, dim=-1).unflatten(-1, (2, 3)) @ self.rotation

@@ -20,7 +20,7 @@ from nerif.geometry.camera import Camera, Plane
 from nerif.geometry.grid import Box
 from nerif.geometry.rays import Rays
 
-__all__ = ["Suspect", "background_cuts", "likely_cause", "rays_on_lattice", "rig_findings", "suspects"]
+__all__ = ["Suspect", "background_cuts", "interface_cuts", "likely_cause", "rays_on_lattice", "rig_findings", "suspects"]
 
 MIN_EDGE, MAX_EDGE = 1.0, 1e4  # mm, of the longest edge of a box
 PIXELS, COARSE_PIXELS = 33, 9  # along an edge of an image that are traced, alone and for a comparison of views
@@ -154,6 +154,17 @@ def background_cuts(camera: Camera, box: Box, rays: Rays) -> bool:
     sight = camera.sight((camera.background.offset * normal).to(camera.rotation))
     behind = -plane * float(sight.to(normal) @ normal)
     return float(behind.min()) <= 0 or not bool(through.unobstructed.all())
+
+
+def interface_cuts(camera: Camera, box: Box) -> bool:
+    """Return whether a part of the box is in front of an interface, as the camera sees it."""
+    corners = _points(box, 2)
+    for interface in camera.interfaces:
+        normal = interface.normal
+        normal = normal if float(camera.rotation[2].to(normal) @ normal) > 0 else -normal
+        if float((corners @ normal).min() - interface.offset * (normal @ interface.normal)) < -1e-6 * max(box.edges):
+            return True
+    return False
 
 
 def _plausible(camera: Camera, box: Box) -> bool:

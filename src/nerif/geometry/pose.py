@@ -5,7 +5,8 @@
     x' = x / (1 + k)        focal length larger by the factor 1 + k
     plane: offset' = offset + b, away from the camera
 
-A ray moves with its camera: X' = C' + R'^T R (X - C). So rays are corrected without tracing them again.
+A ray moves with its camera: X' = C' + R'^T R (X - C). So rays are corrected without tracing them again, except those
+through interfaces, which stay in place.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from torch import Tensor
 
 from nerif.geometry.camera import Camera, Plane
@@ -90,7 +91,20 @@ class Corrections:
             sharp = of["focus"] / (direction * axis).sum(-1)
             focus = torch.where(of["focus"].isnan(), lens.focus if ends is None else ends.distance, sharp)
             lens = replace(lens, axis=axis, focus=focus, normal=axis if ends is None else lens.normal)
-        return replace(rays, origin=origin, direction=direction, background=ends, lens=lens).clip(box)
+        corrected = replace(rays, origin=origin, direction=direction, background=ends, lens=lens)
+        return self._through_interfaces(corrected, views).clip(box)
+
+    def _through_interfaces(self, rays: Rays, views: Int64[Tensor, " n"]) -> Rays:
+        """Rays with those of cameras behind interfaces traced again from their pixels."""
+        for v, camera in enumerate(self.corrected if any(c.interfaces for c in self.cameras) else ()):
+            where = (views == v).nonzero()[:, 0]
+            if not camera.interfaces or not len(where):
+                continue
+            traced = camera.rays(rays.pixel[where].double().cpu(), rays.background is not None)
+            lens = None if rays.lens is None or traced.lens is None else replace(traced.lens, box=rays.lens.box)
+            traced = replace(traced, view=rays.view[where], lens=lens)
+            rays = rays.each(lambda old, new, i=where: old.index_copy(0, i, new.to(old)), traced)
+        return rays
 
 
 def rotation_matrix(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:

@@ -83,6 +83,9 @@ def run(settings: Calibrate) -> None:
         _draw(rig, *_cameras(settings, box))
         return
     no_images = settings.simple or is_calibration(settings.source)
+    if settings.taken_over.interfaces is not None and (settings.simple or not no_images):
+        remedy = "calibrate first, then run nerif calibrate calibration.toml --interfaces"
+        raise InputError(f"expected together with a calibration file; {remedy}", field="interfaces")
     check_output(out, settings.force, endings=(".toml",))
     check_output(rig, True, errors)
     if settings.simple:

@@ -98,6 +98,9 @@ def _measurement(path: Path, m: Measurement) -> None:
     if sigmas:
         turn, shift = (float(torch.stack(sigmas)[:, part].square().mean().sqrt()) for part in (slice(3), slice(3, 6)))
         say(f"  pose_sigma     {math.degrees(turn):.2g} deg, {shift:.2g} mm (for --refine cameras)")
+    for planes in dict.fromkeys(tuple(plane.index for plane in c.interfaces) for c in m.cameras if c.interfaces):
+        names = ", ".join(c.name for c in m.cameras if tuple(plane.index for plane in c.interfaces) == planes)
+        say(f"  interfaces     index {', '.join(f'{index:g}' for index in planes)} behind them: {names}")
     for name, offset in m.frame_offsets.items():
         say(f"  frame offset   {name} {offset:+d}")
     say(f"  flow mask      {'yes' if m.flow_mask is not None else 'no'}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
@@ -194,6 +195,9 @@ class ImportSettings:
     pose_sigma_deg: Annotated[float, Ge(0), Lt(math.inf)] | None = None
     """Standard deviation of the camera rotations, degrees; default with target images: 0.005 in addition to their
     noise; with --simple: 0.5."""
+    interfaces: Path | None = None
+    """File .toml of windows between cameras and flow that were not there during the calibration: tables [[interface]]
+    with normal, offset (mm), index and, if not of all cameras, views."""
 
     def __post_init__(self) -> None:
         if self.focus_distance is not None and self.aperture_diameter is None:

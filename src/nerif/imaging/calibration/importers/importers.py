@@ -14,10 +14,10 @@ from pathlib import Path
 import torch
 
 from nerif.common.conventions import InputError
-from nerif.common.files import check_file, check_known, ending
-from nerif.data.cameras_file import CalibratedCamera, check_camera, check_names, read_box
+from nerif.common.files import check_file, check_known, ending, read_toml
+from nerif.data.cameras_file import CalibratedCamera, check_camera, check_names, interface_of, read_box
 from nerif.data.kinds import ARRAYS, CALIBRATION, IMAGES, VECTORS, reading_as
-from nerif.geometry import Box, Lens, Plane
+from nerif.geometry import Box, Interface, Lens, Plane
 from nerif.geometry.distortion import POWERS
 from nerif.imaging.calibration.calibration_settings import ImportSettings
 from nerif.imaging.calibration.importers.colmap import COLMAP, read_colmap
@@ -72,7 +72,28 @@ def import_cameras(
     names = [c.name for c in cameras]
     check_known(only, names, "views", "camera", f" of {', '.join(names)}")
     settings = replace(settings, scale_mm=settings.scale_mm or unit)
-    return tuple(check_camera(_completed(c, settings), str(path)) for c in cameras if not only or c.name in only)
+    interfaces = _interfaces(settings.interfaces, names)
+    completed = (_completed(c, settings) for c in cameras if not only or c.name in only)
+    return tuple(check_camera(replace(c, interfaces=interfaces.get(c.name, c.interfaces)), str(path)) for c in completed)
+
+
+def _interfaces(path: Path | None, names: Sequence[str]) -> dict[str, tuple[Interface, ...]]:
+    """Return the interfaces of cameras by name, in order from the camera."""
+    result: dict[str, tuple[Interface, ...]] = {}
+    if path is None:
+        return result
+    tables = read_toml(path, "file; expected tables [[interface]]").get("interface")
+    if not isinstance(tables, list) or not tables or not all(isinstance(table, dict) for table in tables):
+        raise InputError("expected at least one table [[interface]], got none", field=path)
+    for i, table in enumerate(tables):
+        where, views = f"{path}: interface {i + 1}", table.get("views", list(names))
+        if not isinstance(views, list):
+            raise InputError(f"views: expected names of cameras in brackets, got {views!r}", field=where)
+        check_known(map(str, views), names, f"{where}: views", "camera")
+        plane = interface_of({key: value for key, value in table.items() if key != "views"}, where)
+        for name in map(str, views):
+            result[name] = (*result.get(name, ()), plane)
+    return result
 
 
 def _read(path: Path, settings: ImportSettings, say: Callable[[str], None]) -> tuple[Sequence[CalibratedCamera], float]:
@@ -129,6 +150,7 @@ def _completed(camera: CalibratedCamera, settings: ImportSettings) -> Calibrated
     if not camera.projection.shows_depth:  # (x, y) are lengths in the unit of the file
         intrinsics[:2, :2] /= scale
         distortion = distortion / scale ** torch.tensor(POWERS)
+    planes = tuple(replace(p, offset=scale * p.offset) for p in camera.interfaces)
     sigma = camera.pose_sigma
     if sigma is not None:
         sigma = torch.cat([sigma[:3], scale * sigma[3:]])
@@ -138,5 +160,5 @@ def _completed(camera: CalibratedCamera, settings: ImportSettings) -> Calibrated
     return replace(
         camera, intrinsics=intrinsics, distortion=distortion, translation=scale * camera.translation,
         image_size=camera.image_size or settings.image_size, background=plane, lens=_lens(camera.lens, settings),
-        pose_sigma=sigma,
+        pose_sigma=sigma, interfaces=planes,
     )  # fmt: skip
