@@ -50,7 +50,7 @@ N_AMBIENT = 1.00027
 NAMES = (
     "study", "methods", "one_camera", "absorption", "displacement", "calibration", "rigs", "images", "trust",
     "sequence", "voxel_cost", "full_size", "verdicts", "goals", "frame_offsets", "detail",
-    "bodies", "velocity", "paper_preset", "vectors", "media",
+    "bodies", "velocity", "paper_preset", "vectors", "media", "windows",
 )  # fmt: skip
 PAGE_SECONDS = 180.0  # between two versions of a page during a run
 PRELOADED = [

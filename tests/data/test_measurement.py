@@ -41,6 +41,7 @@ def test_file_is_plain_netcdf_and_read_as_written(full, tmp_path):
         formats = variables()
         others = {name for k in TECHNIQUES.values() if k is not Deflection for name in (k.measured, k.sigma, *k.beside)}
         later = {"aperture_diameter", "focus_distance", "window", "pose_sigma", "tilt", "frame_offset"}
+        later |= {"interface_normal", "interface_offset", "interface_index"}
         later |= {"hidden", "body_vertices", "body_faces", "body_of_face", "body_rotation", "body_translation"}
         assert set(dataset.data_vars) == set(formats) - later - others
         for name in dataset.data_vars:

@@ -16,6 +16,7 @@ from nerif.fields.phantoms import GaussianBalls
 from nerif.forward.deflection import LeverArm
 from nerif.forward.path_integral import PathIntegral, project
 from nerif.geometry import Box, Camera, Interface, Lens, Ring
+from nerif.geometry.interfaces import Line
 from nerif.geometry.pose import Corrections
 from nerif.simulation.simulate import simulate
 from refusals import refused
@@ -55,7 +56,7 @@ def camera(request) -> Camera:
 
 def test_rays_obey_snells_law_by_angles_and_stay_in_the_plane_of_incidence(camera):
     plain, bent = (c.rays(camera.pixel_grid().reshape(-1, 2)) for c in (replace(camera, interfaces=()), camera))
-    first, *_, last = camera.interfaces
+    last = camera.interfaces[-1]
     if len(camera.interfaces) == 2:  # parallel planes: the glass changes no angle
         turned = torch.linalg.cross(bent.direction, last.normal.expand_as(bent.direction)) * last.index
         before = torch.linalg.cross(plain.direction, last.normal.expand_as(bent.direction))
@@ -210,3 +211,25 @@ def test_bad_interfaces_are_refused():
     for planes in (far, cutting, window[::-1], wedge, window[:1], plate(camera, 60.0, 20.0, 1.333)):
         with refused(f"interfaces of view '{camera.name}'"):
             replace(data, cameras=(replace(camera, interfaces=planes),))
+
+
+@pytest.mark.parametrize("tilt", [0.0, 15.0])
+def test_a_far_window_acts_as_a_pattern_that_is_nearer(tilt):
+    """By thickness (1 - 1/n), docs/windows.md: a ray deflected at path length s, exactly through the far glass."""
+    camera = ring(1)[0]
+    far = replace(camera, interfaces=plate(camera, 260.0, 20.0, 1.0, tilt))
+    pixels, angle, s = camera.pixel_grid().reshape(-1, 2), 1e-4, 200.0
+    plain = replace(camera, background=replace(camera.plane, offset=camera.plane.offset + 20 * (1 - 1 / GLASS)))
+    rays = plain.rays(pixels)
+    down = camera.rotation[1].expand_as(rays.direction)
+    shift = angle * torch.nn.functional.normalize(torch.linalg.cross(rays.direction, down), dim=-1)
+    none = torch.zeros(2, 3, dtype=F64)
+    bent = Line.of(rays.origin + s * rays.direction, rays.direction + shift, none, none)
+    bent = bent.behind(far.interfaces, True)
+    reach = (camera.plane.offset - bent.origin @ camera.plane.normal) / (bent.direction @ camera.plane.normal)
+    exact = pixels - far.project(bent.origin + reach[:, None] * bent.direction)
+    model = ((rays.ends.distance - s)[:, None, None] * rays.ends.sensitivity @ shift[..., None])[..., 0]
+    assert float((model - exact).norm() / exact.norm()) < 5e-3
+    there = camera.rays(pixels)
+    ignored = ((there.ends.distance - s)[:, None, None] * there.ends.sensitivity @ shift[..., None])[..., 0]
+    assert float((ignored - exact).norm() / exact.norm()) > 0.02

@@ -177,8 +177,8 @@ class Camera:
         unseen = self.unseen
         if unseen > 0.5 and self.interfaces and replace(self, interfaces=()).unseen <= 0.5:
             raise InputError(
-                "expected planes in front of the camera in the order in which its rays cross them, got total reflection "
-                f"or another order over {unseen:.0%} of the image",
+                "expected planes in front of the camera in the order in which its rays cross them, got another order "
+                f"or total reflection over {unseen:.0%} of the image",
                 field=f"interfaces of view '{self.name}'",
             )
         if unseen > 0.5:

@@ -1,6 +1,6 @@
-"""Plane interfaces between a camera and the flow, such as windows and tanks: exact refraction of rays, and its inverse.
+"""Plane interfaces between a camera and the flow, such as windows and tanks: exact refraction of rays, its inverse.
 
-With indices n_1, n_2 before and behind a plane of unit normal N (N . t > 0), r = n_1 / n_2 and c = N . t, Snell's law is
+With indices n_1, n_2 before and behind a plane of unit normal N (N . t > 0), r = n_1 / n_2, c = N . t, Snell's law is
 
     t' = r t + (g - r c) N,    g = (1 - r^2 (1 - c^2))^(1/2)    imaginary at total reflection
     X  = O + l t,              l = (offset - N . O) / c

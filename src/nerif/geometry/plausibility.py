@@ -20,7 +20,15 @@ from nerif.geometry.camera import Camera, Plane
 from nerif.geometry.grid import Box
 from nerif.geometry.rays import Rays
 
-__all__ = ["Suspect", "background_cuts", "interface_cuts", "likely_cause", "rays_on_lattice", "rig_findings", "suspects"]
+__all__ = [
+    "Suspect",
+    "background_cuts",
+    "interface_cuts",
+    "likely_cause",
+    "rays_on_lattice",
+    "rig_findings",
+    "suspects",
+]
 
 MIN_EDGE, MAX_EDGE = 1.0, 1e4  # mm, of the longest edge of a box
 PIXELS, COARSE_PIXELS = 33, 9  # along an edge of an image that are traced, alone and for a comparison of views

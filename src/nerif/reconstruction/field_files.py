@@ -103,8 +103,8 @@ def _parts(camera: Camera) -> tuple[Any, ...]:
     tilt = (camera.tilt,) if bool(camera.tilt.any()) else ()
     lens: tuple[Any, ...] = () if camera.lens is None else (camera.lens.diameter, camera.lens.focus)
     lens += (camera.lens.window,) if camera.lens is not None and camera.lens.window else ()
-    optics += tuple(part for i in camera.interfaces for part in (i.normal, i.offset, i.index))
-    return (*optics, *tilt, camera.image_size, *(() if plane is None else (plane.normal, plane.offset)), *lens)
+    planes = [part for plane in camera.interfaces for part in (plane.normal, plane.offset, plane.index)]
+    return (*optics, *tilt, *planes, camera.image_size, *(() if plane is None else (plane.normal, plane.offset)), *lens)
 
 
 def digest(parts: Iterable[Any]) -> str:

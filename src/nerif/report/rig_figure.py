@@ -136,7 +136,10 @@ def image_corners(camera: Camera, target: Float[np.ndarray, 3]) -> ImageCorners:
     before = np.minimum(0.0, depth - 2 * np.linalg.norm(origin[2] - origin[0]))
     first = np.maximum(before, rays.begin.numpy()[:, None])
     last = depth if rays.background is None else rays.background.distance.numpy()[:, None]
-    return ImageCorners(origin + first * direction, direction, origin + last * direction)
+    start = origin + first * direction
+    if camera.interfaces and camera.projection.shows_depth:  # not where the ray begins, on the last interface
+        start = np.broadcast_to(camera.centre.double().numpy(), start.shape)
+    return ImageCorners(start, direction, origin + last * direction)
 
 
 def _closed(axes: Axes3D, corners: np.ndarray, **style: object) -> None:

@@ -74,7 +74,9 @@ def import_cameras(
     settings = replace(settings, scale_mm=settings.scale_mm or unit)
     interfaces = _interfaces(settings.interfaces, names)
     completed = (_completed(c, settings) for c in cameras if not only or c.name in only)
-    return tuple(check_camera(replace(c, interfaces=interfaces.get(c.name, c.interfaces)), str(path)) for c in completed)
+    return tuple(
+        check_camera(replace(c, interfaces=interfaces.get(c.name, c.interfaces)), str(path)) for c in completed
+    )
 
 
 def _interfaces(path: Path | None, names: Sequence[str]) -> dict[str, tuple[Interface, ...]]:
