@@ -110,9 +110,7 @@ def _solved(
     """Return both unknowns, and their standard deviations for independent errors."""
     terms = abs(matrix[0, 0] * matrix[1, 1]) + abs(matrix[0, 1] * matrix[1, 0])
     if abs(np.linalg.det(matrix)) < SAME * terms:
-        raise InputError(
-            "expected wavelengths that separate both, got the same relation twice", field="wavelengths_nm"
-        )
+        raise InputError("expected wavelengths that separate both, got the same relation twice", field="wavelengths_nm")
     inverse = np.linalg.inv(matrix)
     x = [field.values.double() for field in fields]
     first, second = (row[0] * x[0] + row[1] * x[1] for row in inverse)
