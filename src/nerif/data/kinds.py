@@ -25,7 +25,7 @@ from nerif.forward.registry import TECHNIQUES
 __all__ = [
     "ARRAYS", "BOST", "CALIBRATION", "EXPERIMENT", "FIELD", "IMAGES", "MEASUREMENT", "RESULT", "RUN", "SEQUENCE",
     "SEQUENCE_KIND", "SEQUENCE_RESULT", "TRUE_SEQUENCE", "VELOCITY", "VELOCITY_KIND", "VOLUME", "Kind", "are_vectors",
-    "check_kind", "kind_of", "known_conventions", "reading_as",
+    "check_kind", "kind_of", "known_conventions", "reading_as", "vector_program",
 ]  # fmt: skip
 
 BOST = ("BOST-1.0", "BOST-1.1", "BOST-1.2", "BOST-1.3")
@@ -101,10 +101,12 @@ VECTORS = Kind(
     "put them into FOLDER/VIEW, and read them: nerif vectors FOLDER --calibration calibration.toml -o m.nc",
 )
 PROGRAMS = {
-    "PIVlab": rb"^PIVlab ", "DaVis": rb"^#\w+ [\d.]+ [23]D-vector|^TITLE *= *\"B\d{5}|\"isValid\"",
-    "Insight": rb"\"CHC\"|TSI", "Dynamic Studio": rb"^>>\*HEADER\*<<", "OpenPIV": rb"^# *x\s+y\s+u\s+v",
+    "Dynamic Studio": r"^>>\*HEADER\*<<|^FileID:DSExport", "Insight": r"\"CHC\"|TSI",
+    "PIVlab": r"^(# )?PIVlab |\"isNaN\"|px/frame",
+    "DaVis": r"^#\w+ [\d.]+ [23]D-vector|^TITLE *= *\"B\d{5}|\"isValid\"", "OpenPIV": r"^# *x\s+y\s+u\s+v",
 }  # fmt: skip
 """Marks of programs in the first lines of vectors that they write as text."""
+NERIF = 'TITLE = "nerif"'  # an export
 DAVIS = (".vc7", ".v7")
 PIVLAB = {"u_original", "u_filtered", "typevector_original", "resultslist"}
 PIVVIEW = {"piv_data", "piv_flags"}
@@ -231,12 +233,20 @@ def _vectors(path: Path) -> Kind | None:
     elif suffix in (".txt", ".dat", ".csv", ".vec"):
         with path.open("rb") as file:
             head = file.read(MAX_HEAD)
-        program = next((name for name, mark in PROGRAMS.items() if re.search(mark, head, re.MULTILINE)), "")
-        if not (program or _are_vectors(head.decode("latin-1").splitlines()[:10])):
+        text = head.decode("latin-1")
+        if NERIF in text:
+            return None
+        program = vector_program(text)
+        if not (program or _are_vectors(text.splitlines()[:10])):
             return None
     else:
         return None
     return replace(VECTORS, name=f"vectors of {program}") if program else VECTORS
+
+
+def vector_program(head: str) -> str:
+    """Return the program that wrote vectors as text, by their first lines; "" if unknown."""
+    return next((name for name, mark in PROGRAMS.items() if re.search(mark, head, re.MULTILINE)), "")
 
 
 def _are_vectors(lines: list[str]) -> bool:

@@ -11,6 +11,7 @@ import numpy as np
 
 from nerif.common.conventions import InputError
 from nerif.common.text_tables import TextTable, read_numbers
+from nerif.data.kinds import vector_program
 from nerif.imaging.vectors.program import (
     DANTEC,
     DAVIS,
@@ -40,10 +41,7 @@ MISSING: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "typevector": lambda f: f != 1, "isvalid": lambda f: f <= 0, "valid": lambda f: f <= 0, "chc": lambda f: f <= 0,
 }  # fmt: skip
 """Which values of a column of flags mean that there is no vector."""
-PROGRAMS = (
-    (DANTEC, r"^>>\*HEADER\*<<|^FileID:DSExport"), (INSIGHT, r"\"CHC\""), (PIVLAB, r"PIVlab|\"isNaN\"|px/frame"),
-    (DAVIS, r"^#\w+ [\d.]+ [23]D-vector|^TITLE *= *\"B\d+|\"isValid\""), (OPENPIV, r"^# *x\s+y\s+u\s+v"),
-)  # fmt: skip
+PROGRAMS = {program.name: program for program in (DANTEC, DAVIS, INSIGHT, OPENPIV, PIVLAB)}
 DAVIS_TEXT = re.compile(r"#\w+ [\d.]+ ([23])D-vector (\d+) (\d+) (\d+) (.*)")
 INSIGHT_ENTRY = r'{}="([-+.\dEe]+)"'
 
@@ -58,7 +56,7 @@ def read_text_vectors(path: Path, settings: VectorSettings) -> ProgramVectors:
     """Read the vectors of one view and one instant."""
     table = _with_units(read_numbers(path))
     head = "\n".join(table.head)
-    program = next((p for p, mark in PROGRAMS if re.search(mark, head, re.MULTILINE)), None)
+    program = PROGRAMS.get(vector_program(head))
     if program is DAVIS and (match := DAVIS_TEXT.search(head)):
         return _davis(table, match, path)
     if program is None:
