@@ -125,12 +125,15 @@ def test_film_of_numbered_files_and_its_mean(rig: Rig, tmp_path: Path) -> None:
     assert mean.sigma is not None
     assert STEP * float(mean.sigma[mean.usable].median()) == pytest.approx(0.1 / 11**0.5, rel=0.1)
     out = tmp_path / "film.zarr"
-    assert not run(
-        "vectors", tmp_path, "--calibration", rig.calibration, "--out", out, "--frame-rate", 500, "--window", WINDOW
-    )
+    words = ("vectors", tmp_path, "--calibration", rig.calibration, "--out", out, "--frame-rate", 500, "--window")
+    assert not run(*words, WINDOW)
     sequence = MeasurementSequence.read(out)
     assert sequence.times[1] == pytest.approx(0.002)
     assert len(sequence) == 12
+    before = {path: path.stat().st_mtime_ns for path in (out / "displacement" / "c").rglob("*")}
+    assert not run(*words, WINDOW)  # nothing is left to do
+    assert before == {path: path.stat().st_mtime_ns for path in (out / "displacement" / "c").rglob("*")}
+    assert run(*words, WINDOW + 1) == 2  # a store of other settings
     stored = sequence.frame(11)
     torch.testing.assert_close(stored.displacements[stored.usable], last.displacements[last.usable])
 

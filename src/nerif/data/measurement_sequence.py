@@ -171,6 +171,22 @@ class MeasurementSequence:
             raise InputError(f"no valid frame; the first: {first_error}")
         return best
 
+    @classmethod
+    def resumed(cls, path: Path, name: str, settings: dict[str, Any]) -> MeasurementSequence:
+        """Open a store to continue it; refuse one that was begun with other settings, in its attribute `name`."""
+        import zarr
+
+        sequence = cls.read(path)
+        if zarr.open_group(path, mode="r").attrs.get(name) != settings:
+            raise InputError("exists already with other settings; give another --out, or --force", field=path)
+        return sequence
+
+    def record(self, name: str, settings: dict[str, Any]) -> None:
+        """Store the settings with which the frames are made, for `resumed`."""
+        import zarr
+
+        zarr.open_group(self.path, mode="r+").attrs[name] = settings
+
     # -- writing -------------------------------------------------------------------------------------------------
 
     @classmethod

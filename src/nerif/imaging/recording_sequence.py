@@ -22,6 +22,8 @@ from nerif.imaging.workers import work
 
 __all__ = ["frame_numbers", "instants_of", "measure_frame", "measure_recording", "references_of"]
 
+NAME = "displacement"
+"""Attribute of a store with the settings of its measurement."""
 ROUNDING = 1e-9  # relative to the largest of the numbers compared
 
 
@@ -116,7 +118,7 @@ def measure_recording(
     if len(numbers) < numbers[-1] + 1 - numbers[0]:
         settings["frames"] = list(numbers)
     settings = json.loads(json.dumps(settings, default=str))
-    sequence = _existing(out, settings) if out.exists() and not force else None
+    sequence = MeasurementSequence.resumed(out, NAME, settings) if out.exists() and not force else None
     for note in recording.notes:
         say(f"note: {note}")
     references = references_of(recording, say, on_step, processes)
@@ -137,15 +139,6 @@ def measure_recording(
         for line in lines:
             say(f"frame {numbers[todo[i]]}: left out: {line}")
     say(f"{out}: {len(numbers)} frames of {len(references)} views, {incomplete} of them incomplete")
-    return sequence
-
-
-def _existing(out: Path, settings: dict[str, Any]) -> MeasurementSequence:
-    import zarr
-
-    sequence = MeasurementSequence.read(out)
-    if zarr.open_group(out, mode="r").attrs.get("displacement") != settings:
-        raise InputError("exists already with other settings; give another --out, or --force", field=out)
     return sequence
 
 
@@ -194,8 +187,6 @@ def _create(
     settings: dict[str, Any], force: bool, say: Callable[[str], None],
 ) -> MeasurementSequence:  # fmt: skip
     """A new store with the first frame that has all views, whose notes stand for those of all frames."""
-    import zarr
-
     reasons = []
     for index, number in enumerate(numbers):
         lines: list[str] = []
@@ -207,7 +198,7 @@ def _create(
             for line in lines:
                 say(f"frame {number}: {line}")
             sequence = MeasurementSequence.create(out, times, measurement, force)
-            zarr.open_group(out, mode="r+").attrs["displacement"] = settings
+            sequence.record(NAME, settings)
             sequence.write_frame(index, measurement)
             return sequence
         reasons += errors

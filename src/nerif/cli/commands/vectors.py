@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -14,6 +14,7 @@ from nerif.cli.output import counting_bar, say
 from nerif.cli.settings import Settings, command
 from nerif.common.conventions import InputError
 from nerif.common.installation import quoted, word_of
+from nerif.common.interruption import if_interrupted
 from nerif.common.locks import locked
 from nerif.common.settings import Count, Flat, Positional
 from nerif.imaging.imaging_settings import Surroundings
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
     from nerif.data.measurement import Measurement
 
 __all__ = ["Vectors", "main", "run"]
+
+UNRECORDED = ("out", "force", "config", "frame", "frame_rate")  # the last two are those of the times
 
 
 @dataclass(frozen=True)
@@ -65,7 +68,9 @@ def run(settings: Vectors) -> Measurement:
 
     out, image = settings.out, settings.out.with_suffix(".png")
     film = out.suffix.lower() == ".zarr"
-    check_output(out, settings.force, *(() if film else (image,)), endings=(".nc", ".zarr"))
+    check_output(
+        out, settings.force or film, *(() if film else (image,)), endings=(".nc", ".zarr")
+    )  # a film is continued
     box = Box.between(settings.lower, settings.upper)
     vectors = VectorFilm.open(
         settings.folder, settings.calibration, settings.vectors, box, settings.surroundings, settings.views, say
@@ -80,8 +85,10 @@ def run(settings: Vectors) -> Measurement:
         if settings.average != 1:
             raise InputError("expected none for a film, got one; write one instant to a .nc file", field="average")
         numbers = range(settings.frame, len(vectors))
-        with locked(out), counting_bar("reading vectors", len(numbers)) as bar:
-            sequence = vectors.write(out, settings.frame_rate, numbers, settings.force, bar)
+        remedy = f"complete frames are kept in {out}; run the same command again to continue"
+        entries = {name: value for name, value in asdict(settings).items() if name not in UNRECORDED}
+        with locked(out), if_interrupted(lambda: remedy), counting_bar("reading vectors", len(numbers)) as bar:
+            sequence = vectors.write(out, settings.frame_rate, numbers, settings.force, bar, entries)
         say(f"{out}: {len(numbers)} frames of {len(vectors.views)} views; next: nerif sequence {quoted(word_of(out))}")
         return sequence.fullest()
     with counting_bar("reading vectors", len(vectors.views)) as bar:

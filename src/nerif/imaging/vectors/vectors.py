@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -35,6 +37,8 @@ TEXT, ARRAYS, DAVIS = (".txt", ".dat", ".csv", ".vec", ".tsv", ".asc"), (".mat",
 ENDINGS = (*TEXT, *ARRAYS, *DAVIS)
 NUMBER = re.compile(r"[ _.\-]*\d+(?:-[\d.]+)?$")
 """Number of a frame at the end of a file name, of Dynamic Studio with its time."""
+NAME = "vectors"
+"""Attribute of a store with the settings of its measurement."""
 MIN_REPEATS = 3
 REPEAT_WINDOW = 5  # vectors, edge of the square over which the variance of repeated frames is averaged
 LEAST_SIGMA = 0.01  # px of the images
@@ -200,13 +204,14 @@ class VectorFilm:
 
     def write(
         self, out: str | os.PathLike[str], frame_rate: float, numbers: Sequence[int] | None = None, force: bool = False,
-        on_frame: Callable[[int], None] = lambda count: None,
+        on_frame: Callable[[int], None] = lambda count: None, settings: Mapping[str, Any] | None = None,
     ) -> MeasurementSequence:  # fmt: skip
-        """Write a measurement for each instant to a Zarr store.
+        """Write a measurement for each instant to a Zarr store, or those that it lacks.
 
         Parameters
         ----------
         frame_rate : 1/s
+        settings : stored; a store with others is not continued
         """
         numbers = range(len(self)) if numbers is None else numbers
         if not frame_rate > 0:
@@ -215,10 +220,15 @@ class VectorFilm:
             )
         times = [i / frame_rate for i in numbers]
         check_instants(times, "frames")
-        first, _ = self.measure((numbers[0],))
-        sequence = MeasurementSequence.create(out, times, first, force)
+        entries = json.loads(json.dumps({**(settings or {}), "times": times}, default=str))
+        if Path(out).exists() and not force:
+            sequence = MeasurementSequence.resumed(Path(out), NAME, entries)
+        else:
+            sequence = MeasurementSequence.create(out, times, self.measure((numbers[0],))[0], force)
+            sequence.record(NAME, entries)
         for index, number in enumerate(numbers):
-            sequence.write_frame(index, first if index == 0 else self.measure((number,))[0])
+            if not sequence.is_written(index):
+                sequence.write_frame(index, self.measure((number,))[0])
             on_frame(index + 1)
         return sequence
 
