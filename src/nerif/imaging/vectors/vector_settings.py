@@ -23,11 +23,11 @@ class VectorSettings(Checked):
     first_image: Literal["reference", "flow"] = "reference"
     """Image from which the vectors point to the other; flow turns all signs."""
     y_axis: Literal["", "up", "down"] = ""
-    """Direction of y and v."""
+    """Direction of y and v (default: by the file and its program)."""
     position_unit: Literal["", "px", *LENGTHS] = ""  # type: ignore[valid-type]
-    """Unit of x and y."""
+    """Unit of x and y (default: by the file, else px)."""
     vector_unit: Literal["", "px", *LENGTHS, *RATES] = ""  # type: ignore[valid-type]
-    """Unit of u and v."""
+    """Unit of u and v (default: by the file, else px)."""
     scale: NonNegative = 0.0
     """Length of a pixel, mm, for vectors in units of length."""
     origin: tuple[float, float] | None = None
