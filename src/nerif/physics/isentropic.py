@@ -17,7 +17,6 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, ClassVar
 
-import torch
 from annotated_types import Ge, Gt, Le, Lt
 
 from nerif.common.conventions import InputError
@@ -130,7 +129,7 @@ class IsentropicSettings(Medium):
         if quantity == "density":
             return density, where
         mach = self.stream_mach(n_ambient)
-        local = torch.full_like(density, total)
+        local = density.new_full(density.shape, total)
         if self.shock_angle and self._normal(mach) > 1:
             jump, loss = self._shock(self._normal(mach))
             local = local.masked_fill(density > stream * (1 + PASSED * (jump - 1)), total * loss)
@@ -148,7 +147,7 @@ class IsentropicSettings(Medium):
         if quantity == "static_pressure":
             return pressure, where
         if not mach:
-            return torch.full_like(density, math.nan), "the stream is at rest"
+            return density.new_full(density.shape, math.nan), "the stream is at rest"
         ambient = self.total_pressure_pa * (stream / total) ** g
         return (pressure - ambient) / (g / 2 * ambient * mach**2), where
 

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 from jaxtyping import Float
 
 from nerif.physics.medium import Medium
@@ -37,6 +36,8 @@ class Tabulated(Medium):
         """Return the quantity in the medium around the flow."""
 
     def values(self, excess: Tensor, n_ambient: float, quantity: str) -> tuple[Tensor, str]:
+        import torch
+
         q, n = self.curve(quantity)
         if n[0] > n[-1]:
             q, n = q[::-1], n[::-1]
