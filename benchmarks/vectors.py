@@ -54,7 +54,7 @@ def measure(
 ) -> dict[str, Any]:  # fmt: skip
     writer = WRITERS[program]
     direct, truth, calibration = _flow(folder, writer.first, views, pixels, voxels, seed)
-    origin, place = writer.first * STEP - 0.5, folder / f"vectors {program} {views}"
+    origin, place = writer.first * STEP - 0.5, folder / f"vectors {program} {views}".replace("/", " per ")
     place.mkdir(exist_ok=True)
     d = STEP * direct.displacements.double().numpy()
     for name, vectors in zip(direct.names, d, strict=True):

@@ -254,3 +254,21 @@ def test_file_that_openpiv_wrote() -> None:
     assert along == pytest.approx(-0.03, abs=0.002)
     assert -u0 / across == pytest.approx(100.25, abs=2.5)  # the noise is 0.1 px
     assert -v0 / along == pytest.approx(80.75 + 1 / 0.03, abs=2.5)
+
+
+def test_a_cut_file_and_a_wrong_scale_are_noticed(
+    rig: Rig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:  # fmt: skip
+    for view in VIEWS:
+        _text(tmp_path, f"{view}.csv", _rows())
+    whole = (tmp_path / "cam5.csv").read_text().splitlines()
+    _text(tmp_path, "cam5.csv", "\n".join(whole[:-18]))
+    words = ("vectors", tmp_path, "--calibration", rig.calibration, "--out", tmp_path.parent / "cut.nc", "--sigma", 0.1)
+    assert not run(*words)
+    assert (
+        "note: views with fewer rows or columns of vectors than others: cam5 (6, 9) of (8, 9)"
+        in capsys.readouterr().out
+    )
+    settings = VectorSettings(position_unit="mm", scale=10.0, sigma=0.1)
+    with pytest.raises(InputError, match=r"at least a pixel apart, got 0.8 px; check --scale"):
+        nerif.read_vectors(tmp_path, rig.calibration, settings)

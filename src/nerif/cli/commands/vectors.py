@@ -94,6 +94,9 @@ def run(settings: Vectors) -> Measurement:
     with counting_bar("reading vectors", len(vectors.views)) as bar:
         measurement, noise = vectors.measure(range(settings.frame, settings.frame + settings.average), bar)
     measurement.write(out)
+    if note := vectors.smaller_grids(measurement):
+        say(f"note: {note}")
+    say("displacements in pixels of the views, which are steps of the grid:")
     print_views(measurement, noise)
     from nerif.report.displacement_figure import save_displacements
 

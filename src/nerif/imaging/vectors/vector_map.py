@@ -137,6 +137,11 @@ class VectorMap:
                     "--scale and --origin of vectors in units of length",
                     field=place,
                 )
+        if self.pixel < 1:
+            raise InputError(
+                f"expected vectors at least a pixel apart, got {self.pixel:.3g} px; check --scale and --position-unit",
+                field=place,
+            )
         if camera.background is None:
             raise InputError(
                 "its camera has no background plane, which displacements need; give nerif calibrate "

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from nerif.common.conventions import InputError, within
+from nerif.common.conventions import InputError
 from nerif.common.files import ending
 from nerif.data.cameras_file import CalibratedCamera
 from nerif.data.measurement import Measurement
@@ -202,6 +202,18 @@ class VectorFilm:
 
         return join_views(results(), self.scene), noise
 
+    def smaller_grids(self, measurement: Measurement) -> str:
+        """Return which views have fewer vectors than others of the same image size, as of cut files; "" if none."""
+        sizes = {view.name: view.camera.image_size for view in self.views}
+        grids = {camera.name: camera.image_size for camera in measurement.cameras}
+        most = {size: max(grids[name] for name in grids if sizes[name] == size) for size in sizes.values()}
+        small = [f"{name} {grids[name]} of {most[sizes[name]]}" for name in grids if grids[name] != most[sizes[name]]]
+        return (
+            f"views with fewer rows or columns of vectors than others: {', '.join(small)}; are their files cut?"
+            if small
+            else ""
+        )
+
     def write(
         self, out: str | os.PathLike[str], frame_rate: float, numbers: Sequence[int] | None = None, force: bool = False,
         on_frame: Callable[[int], None] = lambda count: None, settings: Mapping[str, Any] | None = None,
@@ -279,11 +291,7 @@ def _of_file(path: Path, settings: VectorSettings) -> list[Frame]:
     if kind in ARRAYS:
         return [partial(_same, vectors) for vectors in read_array_vectors(path, settings)]
 
-    def read() -> ProgramVectors:
-        with within(str(path)):
-            return read_text_vectors(path, settings)
-
-    return [read]
+    return [partial(read_text_vectors, path, settings)]
 
 
 def _files(folder: Path, cameras: Sequence[str]) -> dict[str, list[Path]]:
