@@ -87,7 +87,7 @@ def _flow(
         write_cameras(calibration, [CalibratedCamera.from_camera(c) for c in cameras], box=box)
         grid = Voxels.of_resolution(box, voxels)
         values = make_phantom("flame", box, 0).sample(grid)
-        Volume.of(values, grid, "index_excess", N_AMBIENT).write(truth)
+        Volume.of(values, grid, "index_excess", N_AMBIENT).write(truth, force=True)
         _measurement(VoxelField.through(values, grid), cameras, box, first, seed).write(path)
     return Measurement.read(path), read_volume(truth), calibration
 
