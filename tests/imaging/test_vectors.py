@@ -101,10 +101,11 @@ def test_every_program_gives_the_measurement(
     assert float(m.sigma[m.usable].max()) == pytest.approx(0.08 / STEP)
 
 
-def test_vectors_point_to_the_reference(rig: Rig, tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["PIVlab text", "a table"])
+def test_vectors_point_to_the_reference(name: str, rig: Rig, tmp_path: Path) -> None:
     """Images in the other order turn the signs, and the position is that of the flow image at once."""
     for view, grid in zip(VIEWS, rig.grids(0.0), strict=True):
-        WRITERS["PIVlab text"].write(tmp_path / f"{view}.txt", replace(grid, d=-grid.d))
+        WRITERS[name].write(tmp_path / f"{view}{WRITERS[name].ending}", replace(grid, d=-grid.d))
     settings = VectorSettings(first_image="flow", window=WINDOW, sigma=0.1)
     m = nerif.read_vectors(tmp_path, rig.calibration, settings)
     torch.testing.assert_close(m.displacements[m.usable], rig.truth.displacements[m.usable], rtol=0, atol=1e-5)

@@ -46,11 +46,7 @@ class MediumSettings:
 
     def __post_init__(self) -> None:
         check_settings(self)
-        for name, kind in MEDIA.items():
-            changed = [f.name for f in fields(kind) if getattr(getattr(self, name), f.name) != getattr(kind(), f.name)]
-            if name not in ("gas", self.medium) and changed:
-                option = f"--{name}.{changed[0].replace('_', '-')}"
-                raise InputError(f"expected {name} with {option}, got {self.medium}", field="medium")
+        _check_unused({name: getattr(self, name) for name in MEDIA}, self.medium)
 
     @property
     def substance(self) -> Medium:
@@ -68,6 +64,15 @@ class MediumSettings:
         """Name and settings of the medium in use, for a file."""
         name = {} if self.medium == "gas" else {"medium": self.medium}
         return {**name, self.medium: asdict(self.substance)}
+
+
+def _check_unused(groups: Mapping[str, Any], medium: str) -> None:
+    """Refuse settings of a medium that is not in use."""
+    for name, group in groups.items():
+        changed = [f.name for f in fields(group) if getattr(group, f.name) != getattr(type(group)(), f.name)]
+        if name != medium and changed:
+            option = f"--{name}.{changed[0].replace('_', '-')}"
+            raise InputError(f"expected {name} with {option}, got {medium}", field="medium")
 
 
 @dataclass(frozen=True)
@@ -91,6 +96,7 @@ class MediumChanges:
 
     def of(self, settings: Mapping[str, Any]) -> Medium:
         """Return the medium in the settings of a run (run.toml) with the changes."""
+        _check_unused({name: getattr(self, name) for name in MEDIA}, self.medium or "gas")
         if self.medium and self.medium != "gas":
             groups = {name: getattr(self, name) for name in MEDIA if name != "gas"}
             return MediumSettings(medium=self.medium, **groups).substance

@@ -77,6 +77,7 @@ class MixtureSettings(Medium):
         where = f"mole fraction beyond {-BEYOND:g} to {1 + BEYOND:g}: another gas or temperature"
         if quantity == "mole_fraction":
             return x, where
+        x = x.clamp(max=1.0)  # noise beyond the pure gas would divide by a molar mass near 0
         heavy, light = molar_mass(self.jet), molar_mass(self.ambient)
         mass = x * heavy + (1 - x) * light
         if quantity == "mass_fraction":

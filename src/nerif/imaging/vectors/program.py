@@ -29,7 +29,9 @@ class Program:
 
     name: str
     first_pixel: float  #: coordinate of the centre of the first pixel
-    lag: float  #: share of the displacement from the position of a vector to that on the second image
+    lag: float | None
+    """Share of the displacement from the position of a vector to that on the second image; None: it is on the flow
+    image, whichever was first."""
 
 
 # Sources: PIVlab +piv/piv_FFTmulti.m, +export/file_save.m, mat_file_save.m, save_session_function.m; OpenPIV tools.py,
@@ -39,7 +41,7 @@ OPENPIV = Program("OpenPIV", 0.5, MIDDLE)
 DAVIS = Program("DaVis", 0.5, MIDDLE)
 INSIGHT = Program("Insight", 0.5, MIDDLE)
 DANTEC = Program("Dynamic Studio", 0.5, MIDDLE)
-TABLE = Program("a table", 0.0, 0.0)
+TABLE = Program("a table", 0.0, None)
 
 
 def length_unit(text: str) -> str:
@@ -100,12 +102,13 @@ class ProgramVectors:
             f"{scale}{step}, y and v {'up' if self.y_up else 'down'}, the first pixel at {self.program.first_pixel:g}"
         )
 
-    def map(self, height: int | None, place: object) -> VectorMap:
-        """Return the vectors in pixels of the images, u right and v down.
+    def map(self, height: int | None, place: object, flow_first: bool = False) -> VectorMap:
+        """Return the displacements with flow, in pixels of the images, u right and v down.
 
         Parameters
         ----------
         height : of the images, px; needed where y is counted from below
+        flow_first : whether the vectors point from the image with flow to the one without
         """
         scale = self._mm_per_unit_and_pixel(place)
         first = np.array(self.first_pixel or (self.program.first_pixel,) * 2)
@@ -131,12 +134,13 @@ class ProgramVectors:
                     field=place,
                 )
             factor = (RATES[self.vector_unit] * self.time_step if rate else LENGTHS[self.vector_unit]) / scale
+        lag = self.program.lag
+        if flow_first:
+            factor, lag = -factor, None if lag is None else 1 - lag
         v = -self.v if self.y_up else self.v
-        sigma = None if self.sigma is None else self.sigma * factor
+        sigma = None if self.sigma is None else self.sigma * abs(factor)
         x, y = position.T
-        return VectorMap.of_points(
-            x, y, self.u * factor, v * factor, self.valid, place, sigma, self.window, self.program.lag
-        )
+        return VectorMap.of_points(x, y, self.u * factor, v * factor, self.valid, place, sigma, self.window, lag or 0.0)
 
     @staticmethod
     def _height(height: int | None, place: object) -> int:

@@ -94,10 +94,6 @@ class VectorMap:
         """Geometric mean of the steps, px."""
         return math.sqrt(self.step[0] * self.step[1])
 
-    def reversed(self) -> VectorMap:
-        """Return the map of vectors that point from the flow image to the one without flow."""
-        return replace(self, displacement=-self.displacement, lag=1 - self.lag)
-
     def on_flow_image(self) -> VectorMap:
         """Return the displacements at positions of the flow image: d(p) = d0(p - l d0) = d0 - l (d0 . grad) d0.
 

@@ -35,8 +35,8 @@ class VectorSettings(Checked):
     time_step: NonNegative = 0.0
     """Time between the two images, s, for vectors in units of velocity."""
     window: NonNegative = 0.0
-    """Edge of the interrogation window of the last pass, px of the images; 0: from the file, or two steps of the
-    grid."""
+    """Edge of the interrogation window of the last pass, px of the images; 0: two steps of the grid, the usual overlap
+    of a half."""
     noise: Literal["auto", "file", "repeats", "neighbours"] = "auto"
     """Standard deviation of the vectors: uncertainty in the file, scatter of the averaged frames (three or more), or
     scatter among neighbours; auto: the first of these that there is."""

@@ -62,8 +62,8 @@ class VectorView:
         """Return the vectors of one instant on the grid of the flow image, in px of the images."""
         place = f"view '{self.name}'"
         height = None if self.camera.image_size is None else self.camera.image_size[0]
-        vectors = self.frames[index]().stated(self.settings).map(height, place)
-        return (vectors.reversed() if self.settings.first_image == "flow" else vectors).on_flow_image()
+        flow_first = self.settings.first_image == "flow"
+        return self.frames[index]().stated(self.settings).map(height, place, flow_first).on_flow_image()
 
     def measure(self, numbers: Sequence[int]) -> ViewMeasurement:
         """Return camera, mean displacement over these instants, and its noise."""
