@@ -26,6 +26,7 @@ from nerif.data.measurement_sequence import MeasurementSequence
 from nerif.data.volume_sequence import VolumeSequence
 from nerif.geometry import Ring
 from nerif.reconstruction.neural.presets import preset as settings_of
+from nerif.simulation.simulated_rig import SimulatedRig
 from nerif.simulation.simulation import Simulation
 from nerif.workflow.sequence.chunk import reconstruct_frames
 from nerif.workflow.sequence.plan import SequencePlan, SequenceSettings
@@ -56,7 +57,8 @@ def film(folder: Path, views: int, frames: int, pixels: int, interval: float, no
     if not out.exists():
         ring = Ring(views=views, image_size=(pixels, pixels), pixel_pitch=0.02 * 200 / pixels)
         simulation = Simulation(noise=noise, truth_voxels=voxels)
-        simulate(Simulate(out=out, times=f"0:{(frames - 1) * interval}:{frames}", simulation=simulation, ring=ring))
+        times, rig = f"0:{(frames - 1) * interval}:{frames}", SimulatedRig(ring=ring)
+        simulate(Simulate(out=out, times=times, simulation=simulation, rig=rig))
     return out
 
 

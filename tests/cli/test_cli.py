@@ -137,7 +137,7 @@ def test_project_into_the_same_and_other_cameras(work, tmp_path, refusal):
     residual = (predicted.displacement[0] - measurement.displacement[3])[usable]
     assert float(residual.norm()) < 0.95 * float(measurement.displacement[3][usable].norm())
     assert "names: " in refusal(*words, "--names", "170deg")
-    assert "f_number: " in refusal(*words, "--cameras", work / "m.nc", "--f-number", "8")
+    assert "--f-number: " in refusal(*words, "--cameras", work / "m.nc", "--f-number", "8")
     ring = str.split("--extra-angles 33 --image-size 10 12 --pixel-pitch 0.3 --samples 30 --model")
     for model in ("curved", "paraxial"):
         assert run(*words, *ring, model) == 0
@@ -348,8 +348,8 @@ def test_a_forced_run_with_bad_input_keeps_the_old_result(work, result, refusal,
         ("simulate -o s.nc --phantom cloud", ["cloud", "flame"]),
         ("simulate -o s.nc --phantom absent.nc", ["absent.nc"]),
         ("simulate -o s.txt", [".nc"]),
-        ("simulate -o s.nc --ambient-faces top", ["ambient_faces", "top"]),
-        ("simulate -o s.nc --n-ambient 0", ["n_ambient"]),
+        ("simulate -o s.nc --ambient-faces top", ["--ambient-faces", "top"]),
+        ("simulate -o s.nc --n-ambient 0", ["--n-ambient"]),
         ("simulate -o s.nc --background-distance 10", ["background of view '0deg'"]),
         ("simulate -o nowhere/s.nc", ["nowhere"]),
         ("simulate -o s.nc --noise -1", ["noise"]),

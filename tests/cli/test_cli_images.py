@@ -160,7 +160,7 @@ def test_without_any_valid_view_the_old_measurement_stays(copy, refusal):
         ("--frame -1", "frame: "),
         ("--method piv", "--method"),
         ("--views none", "views: "),
-        ("--frame-offset none 1", "frame_offset: unknown view 'none'"),
+        ("--frame-offset none 1", "--frame-offset: unknown view 'none'"),
         ("--frame-offset none", "--frame-offset"),
         ("--average 0", "average: expected 1 or more"),
         ("--frames all", "out: expected a name ending in .zarr"),

@@ -94,8 +94,8 @@ def test_networks_and_voxels_start_from_each_other(work, tmp_path):
         ("tv --regularisation -1", ["regularisation", "0 or more", "-1"]),
         ("tv --voxels 5000", ["5000 x 5000 x 5000", "GiB", "--voxels"]),
         ("landweber --relaxation 3", ["relaxation"]),
-        ("tikhonov --ambient-faces top", ["ambient_faces", "top"]),
-        ("tikhonov --open-faces x- x+ y- y+ z- z+", ["open_faces"]),
+        ("tikhonov --ambient-faces top", ["--ambient-faces", "top"]),
+        ("tikhonov --open-faces x- x+ y- y+ z- z+", ["--open-faces"]),
         ("tikhonov --start-from nowhere", ["nowhere"]),
     ],
 )

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from calibration_images import detection, target_images
 from nerif.common.files import read_toml
 from nerif.data.cameras_file import read_cameras
-from nerif.geometry import PROJECTIONS, TELECENTRIC, Camera, Plane, Ring
+from nerif.geometry import PROJECTIONS, TELECENTRIC, Camera, Interface, Plane, Ring
 from nerif.imaging.calibration.bundle import INTRINSIC, CameraBundle, Pose, TargetObservation, _ParameterOrder, adjust
 from nerif.imaging.calibration.calibrate import _on_side, calibrate
 from nerif.imaging.calibration.calibration_settings import CalibrationSettings
@@ -113,6 +113,43 @@ def test_centres_distortion_and_backgrounds_of_perspective_cameras_come_back(exa
         assert plane.rms < 0.01
         assert np.abs(np.array(plane.normal) - camera.plane.normal.numpy()).max() < 1e-5
         assert abs(plane.offset - camera.plane.offset) < 0.01
+
+
+def through_windows(cameras: tuple[Camera, ...], behind: float) -> tuple[Camera, ...]:
+    """Cameras with a pane of 20 mm in front, turned by 20 degrees, and another medium behind it."""
+    turn = torch.from_numpy(Rotation.from_rotvec([0, 0, np.radians(20)]).as_matrix())
+    normals = [turn @ -c.rotation[2] for c in cameras]
+    return tuple(
+        replace(c, interfaces=(Interface(n, 140.0, 1.52), Interface(n, 120.0, behind)))
+        for c, n in zip(cameras, normals, strict=True)
+    )
+
+
+@pytest.mark.parametrize("behind", [1.0, 1.333])
+def test_targets_seen_through_windows_give_the_rig_back(tmp_path, behind):
+    """With a tank the world seems nearer, with air behind the pane it is shifted: both come out as they are."""
+    cameras = through_windows(CAMERAS, behind)
+    views = target_images(cameras, TARGET, 0, 12, 0)
+    windows = {camera.name: camera.interfaces for camera in cameras}
+    result = calibrate(views, SETTINGS["perspective"], 480.0, windows)
+    assert result.rms() < 1e-4
+    assert turns(result, cameras).max() < 2e-3
+    result.write(tmp_path / "c.toml")
+    points = torch.from_numpy(np.random.default_rng(0).uniform(-20, 20, (50, 3)))
+    for camera, estimate in zip(cameras, read_cameras(tmp_path / "c.toml"), strict=True):
+        assert len(estimate.interfaces) == 2
+        assert (
+            float((estimate.camera(background=camera.background).project(points) - camera.project(points)).abs().max())
+            < 5e-3
+        )
+    ignored = calibrate(views, SETTINGS["perspective"], 480.0)
+    assert turns(ignored, cameras).max() > 20 * turns(result, cameras).max()
+
+
+def test_windows_in_front_of_telecentric_targets_are_refused():
+    planes = {NAMES[0]: (Interface(torch.tensor([1.0, 0, 0]), 100.0, 1.5),)}
+    with refused("interfaces"):
+        calibrate(images("telecentric"), SETTINGS["telecentric"], interfaces=planes)
 
 
 @pytest.mark.slow
@@ -377,10 +414,11 @@ def small(kind: str) -> tuple[CameraBundle, list[TargetObservation]]:
     tilted = kind == "scheimpflug"
     k[:, 9:] = [(0.1, -0.07), (-0.05, 0.2)] if tilted else 0
     free = (*(True,) * 8, False, *(tilted,) * 2)
-    return CameraBundle(k, cameras, tuple(poses), 0, free, ((400, 500),) * 2), observations
+    planes = tuple(c.interfaces for c in through_windows(pair, 1.333)) if kind == "windows" else ()
+    return CameraBundle(k, cameras, tuple(poses), 0, free, ((400, 500),) * 2, interfaces=planes), observations
 
 
-@pytest.mark.parametrize("kind", [*KINDS, "scheimpflug"])
+@pytest.mark.parametrize("kind", [*KINDS, "scheimpflug", "windows"])
 def test_normal_equations_are_the_slope_of_the_cost(kind):
     bundle, observations = small(kind)
     layout = _ParameterOrder(bundle, observations, noise=10.0)  # in the quadratic part of Huber's loss

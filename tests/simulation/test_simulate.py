@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
-from nerif.fields.phantoms import Flame
+from commands import run
+from nerif.data.cameras_file import CalibratedCamera, write_cameras
+from nerif.data.measurement import Measurement
+from nerif.fields.phantoms import Flame, make_phantom
 from nerif.forward.deflection import MODELS
 from nerif.forward.path_integral import PathIntegral
 from nerif.forward.ray_tracing import CurvedRays
-from nerif.geometry import Ring, paper_rig
+from nerif.geometry import Interface, Ring, paper_rig
 from nerif.simulation.simulate import STEPS, add_noise, simulate, view_displacement
 from refusals import refused
 
@@ -55,6 +60,27 @@ def test_default_steps_are_enough_for_the_flame():
     rays = rays[rays.crosses][::4].to(dtype=torch.float32)
     fine = CurvedRays(4 * STEPS, 1.00027)(flame, rays)
     assert float((CurvedRays(STEPS, 1.00027)(flame, rays) - fine).norm() / fine.norm()) < 5e-4
+
+
+def test_cameras_of_a_calibration_are_simulated_with_their_windows(tmp_path, capsys):
+    """Behind a pane upright to the axis the flow seems nearer by t (1 - 1/n), and no ring's option is taken with it."""
+    camera = Ring(views=1, arc=(0, 0), image_size=(12, 12), pixel_pitch=0.3).cameras()[0]
+    normal, n = camera.rotation[2], 1.5
+    front = float(normal @ (camera.centre + 500 * normal))
+    pane = replace(camera, interfaces=(Interface(normal, front, n), Interface(normal, front + 60, 1.00027)))
+    write_cameras(tmp_path / "pane.toml", [CalibratedCamera.from_camera(pane)])
+    words = ("--calibration", tmp_path / "pane.toml", "--truth-voxels", 8, "--steps", 30)
+    assert not run("simulate", "--out", tmp_path / "m.nc", *words)
+    ours = Measurement.read(tmp_path / "m.nc")
+    assert len(ours.cameras[0].interfaces) == 2
+    forward = replace(camera, translation=camera.translation - torch.tensor([0, 0, 60 * (1 - 1 / n)]))
+    expected = simulate(make_phantom("flame", ours.box), (forward,), ours.box, ours.n_ambient, steps=30)
+    plain = simulate(make_phantom("flame", ours.box), (camera,), ours.box, ours.n_ambient, steps=30)
+    d, near, far = (m.displacement.nan_to_num() for m in (ours, expected, plain))
+    assert float((d - near).norm() / d.norm()) < 0.02
+    assert float((d - far).norm() / d.norm()) > 0.04
+    assert run("simulate", "--out", tmp_path / "n.nc", *words, "--views", 3) == 2
+    assert "--calibration: expected without --f-number and options of a ring" in capsys.readouterr().err
 
 
 def test_views_of_different_size_are_padded_with_nan(ball, box):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +13,7 @@ from nerif.cli.arguments import flag_value, present_name, values_of
 from nerif.cli.help import help_text
 from nerif.common.conventions import InputError
 from nerif.common.files import local_path, read_toml
-from nerif.common.settings import MISSING, Positional, check_settings, merge, options
+from nerif.common.settings import MISSING, check_settings, merge, options
 
 __all__ = ["COMMAND_LINE_ONLY", "Settings", "command", "compute", "read_settings", "setting_of"]
 
@@ -61,7 +62,17 @@ def compute(run: Callable[[S], R], settings: S) -> R:
     from nerif.reconstruction.device import keep_freed_memory, on_free_cores
 
     keep_freed_memory()
-    return on_free_cores(run)(settings)
+    try:
+        return on_free_cores(run)(settings)
+    except InputError as error:
+        raise error.renamed(_flags(settings)) from None
+
+
+def _flags(settings: object) -> dict[str, str]:
+    """Return the options of fields by the fields' names, without those that several records have."""
+    fields = options(settings).values()
+    names = Counter(option.place[-1] for option in fields)
+    return {o.place[-1]: o.label for o in fields if names[o.place[-1]] == 1}
 
 
 def read_settings(default: S, arguments: list[str], name: str, file: Path | None = None) -> S:
@@ -85,8 +96,7 @@ def read_settings(default: S, arguments: list[str], name: str, file: Path | None
         settings = merge(default, values_of(arguments, fields), file=False)
         for option in options(settings).values():
             if option.default is MISSING:
-                field = option.name if Positional in option.marks else option.flag
-                raise InputError(f"expected {option.values}, got none", field=field)
+                raise InputError(f"expected {option.values}, got none", field=option.label)
     except InputError as error:
         raise InputError(f"{error}; see nerif {name} --help") from None
     return settings

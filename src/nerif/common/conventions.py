@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import unicodedata
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import SupportsFloat
 
@@ -52,7 +52,7 @@ class InputError(ValueError):
     """
 
     def __init__(self, message: str, *, field: object = "") -> None:
-        self.field = str(field)
+        self.field, self.message = str(field), message
         super().__init__(f"{self.field}: {message}" if self.field else message)
 
     def inside(self, place: object) -> InputError:
@@ -60,6 +60,13 @@ class InputError(ValueError):
         error = InputError(f"{place}: {self}")
         error.field = self.field
         return error
+
+    def renamed(self, names: Mapping[str, str]) -> InputError:
+        """Return the error with other names of its fields, such as those of options, where all of them have one."""
+        fields = self.field.split(", ")
+        if not str(self).startswith(f"{self.field}: ") or not all(field in names for field in fields):
+            return self
+        return InputError(self.message, field=", ".join(names[field] for field in fields))
 
 
 @contextmanager

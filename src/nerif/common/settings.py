@@ -123,8 +123,8 @@ def _expected(error: dict[str, Any], hint: Any) -> str:
     """Return what was expected in place of an invalid value."""
     kind, context = error["type"], error.get("ctx", {})
     if kind == "literal_error":
-        choices = context["expected"].replace("'", "").replace(" or ", ", ")
-        return f"one of {choices}" if "," in choices else str(choices)
+        choices = [word for word in context["expected"].replace("'", "").replace(" or ", ", ").split(", ") if word]
+        return f"one of {', '.join(choices)}" if choices[1:] else choices[0]
     if kind in ("missing", "too_long"):
         (parts,) = (typing.get_args(part) for part in _alternatives(hint) if typing.get_origin(part) is tuple)
         return f"{_group(parts[0])} values each" if Ellipsis in parts else f"{len(parts)} values"
@@ -155,6 +155,11 @@ class Option:
     def flag(self) -> str:
         """The name on the command line."""
         return "--" + self.name.replace("_", "-")
+
+    @property
+    def label(self) -> str:
+        """What the command line and its errors call it."""
+        return self.name if Positional in self.marks else self.flag
 
     @property
     def off(self) -> str:
@@ -251,7 +256,7 @@ def merge(record: T, values: Mapping[str, Any], place: object = "", file: bool =
         for name, value in values.items():
             option = fields[name]
             changes[option.place] = converted(option.hint, value, name if file else option.flag, file)
-        return _replaced(record, changes)
+        return _replaced(record, changes, {o.place: name if file else o.label for name, o in fields.items()})
     except InputError as error:
         raise error.inside(place) if place else error from None
 
@@ -265,12 +270,18 @@ def _flattened(values: Mapping[str, Any], fields: Mapping[str, Option], prefix: 
             yield name, value
 
 
-def _replaced(record: T, changes: Mapping[tuple[str, ...], Any]) -> T:
+def _replaced(record: T, changes: Mapping[tuple[str, ...], Any], names: Mapping[tuple[str, ...], str]) -> T:
+    """Return settings with changes by place; an InputError has the `names` of options."""
     fields = {place[0]: value for place, value in changes.items() if len(place) == 1}
     for name in dict.fromkeys(place[0] for place in changes if len(place) > 1):
-        inner = {place[1:]: value for place, value in changes.items() if place[0] == name}
-        fields[name] = _replaced(getattr(record, name), inner)
-    return dataclasses.replace(record, **fields)  # type: ignore[type-var]
+        inner, inner_names = (
+            {place[1:]: value for place, value in mapping.items() if place[0] == name} for mapping in (changes, names)
+        )
+        fields[name] = _replaced(getattr(record, name), inner, inner_names)
+    try:
+        return dataclasses.replace(record, **fields)  # type: ignore[type-var]
+    except InputError as error:
+        raise error.renamed({place[0]: name for place, name in names.items() if len(place) == 1}) from None
 
 
 # -- types and texts -------------------------------------------------------------------------------------------------

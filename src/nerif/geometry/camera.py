@@ -133,7 +133,7 @@ class Camera:
     def sight(self, points: Points) -> Points:
         """Return the unit directions of the lines of sight through world points (mm), away from the camera."""
         if self.interfaces:
-            return self._line(self._image(points)).direction
+            return self.line(self.image_point(points)).direction
         return self.projection.sight(self.local(points)) @ self.rotation
 
     def distance(self, points: Points) -> Values:
@@ -143,7 +143,7 @@ class Camera:
     def pixel_size(self, points: Points) -> Values:
         """Return the width of a pixel at world points (mm), across the axis, mm; without distortion and tilt."""
         if self.interfaces:
-            slope = self._line(self._image(points)).image_slope(points)[..., 0, :]
+            slope = self.line(self.image_point(points)).image_slope(points)[..., 0, :]
             return 1 / (self.intrinsics[0, 0] * (slope @ self.rotation[0]))
         return 1 / (self.intrinsics[0, 0] * self.projection.magnification(self.local(points)))
 
@@ -214,7 +214,7 @@ class Camera:
         ideal = from_sensor(torch.stack([x, y], dim=-1), self.distortion, self.tilt)
         zero = torch.zeros_like(pixels[..., 0])
         if self.interfaces:
-            line = self._line(ideal)
+            line = self.line(ideal)
             origin, direction, begin = line.origin + line.begin[..., None] * line.direction, line.direction, -line.begin
         else:
             start, heading = self.projection.lines(ideal)
@@ -295,18 +295,32 @@ class Camera:
         shift[0, 2], shift[1, 2] = column, row
         return replace(self, intrinsics=self.intrinsics - shift, image_size=(height, width))
 
-    def _line(self, image: Pixels) -> Line:
-        """Lines of sight at the image (x, y) behind the interfaces."""
+    def line(self, image: Pixels, motions: bool = False) -> Line:
+        """Return the lines of sight at the image (x, y) behind the interfaces.
+
+        Parameters
+        ----------
+        motions : with derivatives by rotations (rad) of the camera about the axes of the world, and shifts (mm)
+        """
         start, heading = self.projection.lines(image)
         zero, unit = (self.projection.lines(x) for x in (image.new_zeros(1, 2), torch.eye(2, dtype=image.dtype)))
         slopes = [(there - here) @ self.rotation for there, here in zip(unit, zero, strict=True)]
         origin = self.centre + (start @ self.rotation).expand_as(heading)
-        line = Line.of(origin, heading @ self.rotation, slopes[0].expand(2, 3), slopes[1])
+        heading, by_image = heading @ self.rotation, [slopes[0].expand(2, 3), slopes[1]]
+        if motions:
+            axes, shape = torch.eye(3, dtype=image.dtype), (*heading.shape[:-1], -1, -1)
+            turned = [torch.linalg.cross(axes.expand(shape), v[..., None, :]) for v in (origin, heading)]
+            shifted = (axes, torch.zeros_like(axes))
+            by_image = [
+                torch.cat([slope.expand(shape), turn, shift.expand(shape)], dim=-2)
+                for slope, turn, shift in zip(by_image, turned, shifted, strict=True)
+            ]
+        line = Line.of(origin, heading, *by_image)
         return line.behind(self.interfaces, self.projection.shows_depth)
 
-    def _image(self, points: Points) -> Pixels:
-        """The image (x, y) of world points through the interfaces."""
-        return image_of(points, self._line, self.projection.image(self.local(points)))
+    def image_point(self, points: Points) -> Pixels:
+        """Return the image (x, y) of world points through the interfaces, before distortion; NaN if there is none."""
+        return image_of(points, self.line, self.projection.image(self.local(points)))
 
     def _project_jacobian(
         self, points: Points, image: Pixels | None = None
@@ -314,13 +328,13 @@ class Camera:
         """Pixels and d pixel / d X (px/mm); with `image` where (x, y) is available."""
         local = self.local(points)
         if image is None:
-            image = self._image(points) if self.interfaces else self.projection.image(local)
+            image = self.image_point(points) if self.interfaces else self.projection.image(local)
         x, y, (xx, xy, yx, yy) = to_sensor(image, self.distortion, self.tilt)
         k = self.intrinsics
         pixels = torch.stack([k[0, 0] * x + k[0, 1] * y + k[0, 2], k[1, 1] * y + k[1, 2]], dim=-1)
         u, v = (k[0, 0] * xx + k[0, 1] * yx, k[0, 0] * xy + k[0, 1] * yy), (k[1, 1] * yx, k[1, 1] * yy)
         if self.interfaces:
-            by_x, by_y = self._line(image).image_slope(points).unbind(-2)
+            by_x, by_y = self.line(image).image_slope(points).unbind(-2)
             return pixels, torch.stack([w[0][..., None] * by_x + w[1][..., None] * by_y for w in (u, v)], dim=-2)
         # row by row: small matrix products are slow in a batch
         rows = [*self.projection.slope(*u, image, local), *self.projection.slope(*v, image, local)]

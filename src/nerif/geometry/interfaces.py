@@ -11,6 +11,7 @@ A ray depends on the image (x, y) of its pixel, and so do its derivatives, of wh
 
 For a point X = O + s t of the ray behind the last plane, A = dO + s dt across t (two vectors in space) is invertible
 there: d(x, y) / dX = A^+. This gives the sensitivity, and the steps of Newton's method for the ray through a point.
+Where a motion m of the camera moves the ray through its image by dX / dm, d(x, y) / dm = -A^+ dX / dm.
 """
 
 from __future__ import annotations
@@ -57,21 +58,22 @@ class Interface:
 
 @dataclass(frozen=True)
 class Line:
-    """Lines of sight in one medium, and their derivatives by the image (x, y)."""
+    """Lines of sight in one medium, and their derivatives by the image (x, y), and optionally by motions."""
 
     origin: Points  #: mm
     direction: Vectors  #: unit vector
-    origin_slope: Float[Tensor, "*batch 2 3"]  #: d origin / d (x, y)
-    direction_slope: Float[Tensor, "*batch 2 3"]  #: d direction / d (x, y)
+    origin_slope: Float[Tensor, "*batch p 3"]  #: d origin / d (x, y, motions)
+    direction_slope: Float[Tensor, "*batch p 3"]  #: d direction / d (x, y, motions)
 
     @classmethod
     def of(
-        cls, origin: Points, heading: Vectors, origin_slope: Float[Tensor, "2 3"], heading_slope: Float[Tensor, "2 3"]
-    ) -> Line:
+        cls, origin: Points, heading: Vectors, origin_slope: Float[Tensor, "*#batch p 3"],
+        heading_slope: Float[Tensor, "*#batch p 3"],
+    ) -> Line:  # fmt: skip
         """Return lines along headings of any length."""
         length = heading.norm(dim=-1, keepdim=True)
         direction = heading / length
-        slope = _across(heading_slope.expand(*heading.shape[:-1], 2, 3), direction) / length[..., None]
+        slope = _across(heading_slope.expand(*heading.shape[:-1], -1, 3), direction) / length[..., None]
         return cls(origin, direction, origin_slope.expand_as(slope), slope)
 
     def behind(self, interfaces: Sequence[Interface], forward: bool) -> Line:
@@ -108,18 +110,24 @@ class Line:
 
         0 for parallel lines, which have none.
         """
-        slope = self.direction_slope
+        slope = self.direction_slope[..., :2, :]
         square = slope.square().sum((-1, -2))
-        centre = -(_across(self.origin_slope, self.direction) * slope).sum((-1, -2)) / square
+        centre = -(_across(self.origin_slope[..., :2, :], self.direction) * slope).sum((-1, -2)) / square
         return torch.where(square > 0, centre, 0.0)
 
     def image_slope(self, points: Points) -> Float[Tensor, "*batch 2 3"]:
         """Return d (x, y) / d X (1/mm) at points of the lines; 0 along the line."""
         s = ((points - self.origin) * self.direction).sum(-1)[..., None, None]
-        a = _across(self.origin_slope + s * self.direction_slope, self.direction)
+        a = _across((self.origin_slope + s * self.direction_slope)[..., :2, :], self.direction)
         x, y = a.unbind(-2)
         xx, xy, yy = ((i * j).sum(-1, keepdim=True) for i, j in ((x, x), (x, y), (y, y)))
         return torch.stack([yy * x - xy * y, xx * y - xy * x], dim=-2) / (xx * yy - xy * xy)[..., None]
+
+    def motion_slope(self, points: Points) -> Float[Tensor, "*batch 2 m"]:
+        """Return d (x, y) / d motion at points of the lines."""
+        s = ((points - self.origin) * self.direction).sum(-1)[..., None, None]
+        moved = (self.origin_slope + s * self.direction_slope)[..., 2:, :]
+        return -self.image_slope(points) @ moved.transpose(-1, -2)
 
 
 def image_of(points: Points, line_of: Callable[[Pixels], Line], start: Pixels) -> Pixels:
@@ -141,7 +149,7 @@ def image_of(points: Points, line_of: Callable[[Pixels], Line], start: Pixels) -
     return torch.where((error < ACCEPTED * size).all(-1, keepdim=True), image, math.nan)
 
 
-def _across(vectors: Float[Tensor, "*batch 2 3"], direction: Vectors) -> Float[Tensor, "*batch 2 3"]:
+def _across(vectors: Float[Tensor, "*batch p 3"], direction: Vectors) -> Float[Tensor, "*batch p 3"]:
     """The parts of vectors across a unit direction."""
     t = direction[..., None, :]
     return vectors - (vectors * t).sum(-1, keepdim=True) * t

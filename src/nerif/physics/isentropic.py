@@ -23,6 +23,7 @@ from nerif.common.conventions import InputError
 from nerif.common.settings import NonNegative
 from nerif.physics.gas_optics import GAS_CONSTANT, gladstone_dale, molar_mass
 from nerif.physics.medium import Medium, check_pressure, check_temperature, check_wavelength
+from nerif.physics.shock import shock_angle
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -33,6 +34,7 @@ __all__ = ["IsentropicSettings"]
 
 COMPRESSED = 1.05  # density over that of the stream, from which a shock may have lost total pressure
 ABOVE_TOTAL = 0.02  # of the total density that noise explains
+COLDEST = 30.0  # K, below which air condenses even in the short time of a nozzle
 PASSED = 0.5  # of the jump of density at the shock, from which on gas has passed it
 
 
@@ -52,8 +54,10 @@ class IsentropicSettings(Medium):
     mach: NonNegative = 0.0
     """Mach number of the ambient, the stream around the model; 0: from the ambient index."""
     shock_angle: Annotated[float, Ge(0), Le(90)] = 0.0
-    """Angle between shock and stream, degrees, as the field shows it: behind the shock its loss of total pressure is
-    accounted for; 0: behind compressions only the density is given."""
+    """Angle between shock and stream, degrees, as the field shows it (a line of the run has it): behind the shock its
+    loss of total pressure is accounted for; 0: behind compressions only the density is given."""
+    stream: tuple[float, float, float] = (1.0, 0.0, 0.0)
+    """Direction of the stream, by which the angle of a shock in the field is measured."""
     composition: str = "air"
     """Gas or mixture by mole fractions."""
     gamma: Annotated[float, Gt(1), Lt(2)] = 1.4
@@ -65,6 +69,8 @@ class IsentropicSettings(Medium):
         check_pressure(self.total_pressure_pa, "total_pressure_pa")
         check_temperature(self.total_temperature_k, "total_temperature_k")
         check_wavelength(self.wavelength_nm)
+        if not any(self.stream):
+            raise InputError("expected a direction, got 0 0 0", field="stream")
         if self.shock_angle and self.mach and self._normal(self.mach) <= 1:
             least = math.degrees(math.asin(1 / self.mach)) if self.mach > 1 else 90
             raise InputError(
@@ -113,12 +119,16 @@ class IsentropicSettings(Medium):
             return lines
         mach = self.stream_mach(n_ambient)
         lines.append(f"stream: Mach {mach:.3g}, density {self.stream_density(n_ambient):.4g} kg/m3")
-        if self.shock_angle and self._normal(mach) > 1:
+        stated = self.shock_angle and self._normal(mach) > 1
+        if stated:
             jump, loss = self._shock(self._normal(mach))
             lines.append(
                 f"shock of {self.shock_angle:g} degrees: density rises {jump:.3g} times, total pressure falls to "
                 f"{loss:.1%}; compare the former with the field"
             )
+        if mach > 1 and self._is_compressed(excess) and (angle := shock_angle(excess, self.stream)):
+            text = "" if stated else "; --isentropic.shock-angle accounts for its loss of total pressure"
+            lines.append(f"shock in the field: {angle[0]:.1f} degrees (+- {angle[1]:.1f}) to the stream{text}")
         return lines
 
     def values(self, excess: Tensor, n_ambient: float, quantity: str) -> tuple[Tensor, str]:
@@ -135,10 +145,12 @@ class IsentropicSettings(Medium):
             local = local.masked_fill(density > stream * (1 + PASSED * (jump - 1)), total * loss)
         else:
             density = density.masked_fill(density > COMPRESSED * stream, math.nan)
-            where += ", or behind compressions, where a shock may have lost total pressure (--isentropic.shock-angle)"
+            where += ", behind compressions, where a shock may have lost total pressure (--isentropic.shock-angle)"
         ratio = density / local
         ratio = ratio.masked_fill(ratio > 1 + ABOVE_TOTAL, math.nan).clamp(max=1.0)
-        where += ", or above the total density"
+        cold = ratio < (COLDEST / self.total_temperature_k) ** (1 / (g - 1))
+        ratio = ratio.masked_fill(cold, math.nan)
+        where += f", above the total density, or colder than {COLDEST:g} K"
         if quantity == "temperature":
             return self.total_temperature_k * ratio ** (g - 1), where
         if quantity == "mach":
@@ -150,6 +162,10 @@ class IsentropicSettings(Medium):
             return density.new_full(density.shape, math.nan), "the stream is at rest"
         ambient = self.total_pressure_pa * (stream / total) ** g
         return (pressure - ambient) / (g / 2 * ambient * mach**2), where
+
+    def _is_compressed(self, excess: Volume) -> bool:
+        rise = (COMPRESSED - 1) * self._constant * self.stream_density(float(excess.attributes["n_ambient"]))
+        return bool((excess.values > rise).any())
 
     def _shock(self, normal: float) -> tuple[float, float]:
         """Return the ratios of density and of total pressure across a shock of this normal Mach number."""

@@ -25,14 +25,11 @@ MEDIA: Mapping[str, type[Medium]] = {
 
 
 @dataclass(frozen=True)
-class MediumSettings:
-    """The medium that says what follows from the refractive index."""
+class _Media:
+    """The settings of each medium."""
 
-    medium: Literal[*MEDIA] = "gas"  # type: ignore[valid-type]
-    """Medium of the flow: gas (density, temperature), mixture (of two gases), isentropic (a wind tunnel), water, table
-    (another liquid), plasma (docs/media.md)."""
-    gas: GasSettings = field(default_factory=GasSettings)
-    """Gas for density and temperature."""
+    medium: str = ""
+    gas: Any = None
     mixture: MixtureSettings = field(default_factory=MixtureSettings)
     """Two gases that mix, for --medium mixture."""
     isentropic: IsentropicSettings = field(default_factory=IsentropicSettings)
@@ -44,9 +41,29 @@ class MediumSettings:
     plasma: PlasmaSettings = field(default_factory=PlasmaSettings)
     """A plasma, for --medium plasma."""
 
+    def _check_unused(self, medium: str) -> None:
+        """Refuse settings of a medium that is not in use."""
+        for name in MEDIA:
+            group = getattr(self, name)
+            changed = [f.name for f in fields(group) if getattr(group, f.name) != getattr(type(group)(), f.name)]
+            if name != medium and changed:
+                option = f"--{name}.{changed[0].replace('_', '-')}"
+                raise InputError(f"expected {name} with {option}, got {medium}", field="medium")
+
+
+@dataclass(frozen=True)
+class MediumSettings(_Media):
+    """The medium that says what follows from the refractive index."""
+
+    medium: Literal[*MEDIA] = "gas"  # type: ignore[valid-type]
+    """Medium of the flow: gas (density, temperature), mixture (of two gases), isentropic (a wind tunnel), water, table
+    (another liquid), plasma (docs/media.md)."""
+    gas: GasSettings = field(default_factory=GasSettings)
+    """Gas for density and temperature."""
+
     def __post_init__(self) -> None:
         check_settings(self)
-        _check_unused({name: getattr(self, name) for name in MEDIA}, self.medium)
+        self._check_unused(self.medium)
 
     @property
     def substance(self) -> Medium:
@@ -66,37 +83,18 @@ class MediumSettings:
         return {**name, self.medium: asdict(self.substance)}
 
 
-def _check_unused(groups: Mapping[str, Any], medium: str) -> None:
-    """Refuse settings of a medium that is not in use."""
-    for name, group in groups.items():
-        changed = [f.name for f in fields(group) if getattr(group, f.name) != getattr(type(group)(), f.name)]
-        if name != medium and changed:
-            option = f"--{name}.{changed[0].replace('_', '-')}"
-            raise InputError(f"expected {name} with {option}, got {medium}", field="medium")
-
-
 @dataclass(frozen=True)
-class MediumChanges:
+class MediumChanges(_Media):
     """The medium of a result, or another."""
 
     medium: Literal["", *MEDIA] = ""  # type: ignore[valid-type]
     """Medium of the flow; default: that of the result."""
     gas: GasChanges = field(default_factory=GasChanges)
     """Gas for density and temperature."""
-    mixture: MixtureSettings = field(default_factory=MixtureSettings)
-    """Two gases that mix, with --medium mixture."""
-    isentropic: IsentropicSettings = field(default_factory=IsentropicSettings)
-    """Gas from a reservoir, with --medium isentropic."""
-    water: WaterSettings = field(default_factory=WaterSettings)
-    """Water, with --medium water."""
-    table: TableSettings = field(default_factory=TableSettings)
-    """A table of the index, with --medium table."""
-    plasma: PlasmaSettings = field(default_factory=PlasmaSettings)
-    """A plasma, with --medium plasma."""
 
     def of(self, settings: Mapping[str, Any]) -> Medium:
         """Return the medium in the settings of a run (run.toml) with the changes."""
-        _check_unused({name: getattr(self, name) for name in MEDIA}, self.medium or "gas")
+        self._check_unused(self.medium or "gas")
         if self.medium and self.medium != "gas":
             groups = {name: getattr(self, name) for name in MEDIA if name != "gas"}
             return MediumSettings(medium=self.medium, **groups).substance

@@ -71,6 +71,13 @@ class Medium(ABC):
             for reason in dict.fromkeys(absent.values())
         ]
 
+    def assumed(self, excess: Volume) -> list[str]:
+        """Return a line on each relation that gives quantities of a field, with what it assumes."""
+        texts = {q: self.assumption(q) for q in self.quantities_of(excess) if q in self.names}
+        distinct = dict.fromkeys(texts.values())
+        whole = [text for text in distinct if not any(text in other for other in distinct if other != text)]
+        return [f"{', '.join(q for q, part in texts.items() if part in text)}: {text}" for text in whole]
+
     def slope(self, excess: Tensor, n_ambient: float, quantity: str) -> Tensor:
         """Return the derivative of a quantity by the index, by central differences."""
         step = max(LEAST_STEP, STEP * float(excess.nan_to_num().abs().max()))
@@ -169,11 +176,10 @@ def derive_all(excess: Volume, medium: Medium) -> list[Volume]:
 
 
 def masked_lines(volumes: Sequence[Volume]) -> list[str]:
-    """Return a line with number and reason for each quantity with masked voxels."""
-    lines = []
+    """Return a line with number and reason for quantities with masked voxels."""
+    names: dict[str, list[str]] = {}
     for v in volumes:
-        count = int(v.notes.get("masked_voxels", 0))
-        if count:
+        if count := int(v.notes.get("masked_voxels", 0)):
             share = f"{count} of {v.values.numel()} voxels ({percent(count / v.values.numel(), 2)})"
-            lines.append(f"{v.quantity}: {share} are NaN: {v.notes['masked_where']}")
-    return lines
+            names.setdefault(f"{share} are NaN: {v.notes['masked_where']}", []).append(v.quantity)
+    return [f"{', '.join(quantities)}: {line}" for line, quantities in names.items()]

@@ -38,6 +38,8 @@ class PlasmaSettings(Medium):
 
     wavelength_nm: float = 532.0
     """Wavelength of the light, nm."""
+    composition: str = "air"
+    """Gas of the heavy particles, which two wavelengths separate from the electrons."""
 
     def __post_init__(self) -> None:
         check_wavelength(self.wavelength_nm)

@@ -48,8 +48,9 @@ class TableSettings(Tabulated):
                 "expected n to rise or fall all the way with the quantity, got both; shorten it", field=self.file
             )
         if not q.min() <= self.ambient_value("") <= q.max():
+            low, high = (end - self._zero for end in (q.min(), q.max()))
             raise InputError(
-                f"expected a value of the table ({q.min():g} to {q.max():g}), got {self.ambient:g}", field="ambient"
+                f"expected a value of the table ({low:g} to {high:g}), got {self.ambient:g}", field="ambient"
             )
 
     @property
@@ -57,6 +58,11 @@ class TableSettings(Tabulated):
         if self.file is None:
             raise InputError("expected a file for --medium table, got none; give --table.file", field="file")
         return _read(self.file)
+
+    @property
+    def _zero(self) -> float:
+        """Value of the quantity at the zero of the table's unit."""
+        return ZERO_CELSIUS if self._content[1] else 0.0
 
     def available(self, quantity: str) -> tuple[str, ...]:
         name = self._content[0]
@@ -77,7 +83,7 @@ class TableSettings(Tabulated):
         return q, np.array([np.interp(self.wavelength_nm, lights, n) for n in np.stack(columns, axis=1)])
 
     def ambient_value(self, quantity: str) -> float:
-        return self.ambient + (ZERO_CELSIUS if self._content[1] else 0.0)
+        return self.ambient + self._zero
 
     def not_around(self, n_ambient: float) -> str:
         expected = float(np.interp(self.ambient_value(""), *self.curve("")))

@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float
 
+from nerif.common.conventions import with_unit
+from nerif.data.quantity_names import QUANTITIES
 from nerif.physics.medium import Medium
 
 if TYPE_CHECKING:
@@ -44,4 +46,5 @@ class Tabulated(Medium):
         order = np.argsort(q)
         index = np.interp(self.ambient_value(quantity), q[order], n[order]) + excess.cpu().numpy()
         values = np.interp(index, n, q, left=math.nan, right=math.nan)
-        return torch.from_numpy(np.asarray(values)).to(excess), f"{quantity} beyond {q.min():g} to {q.max():g}"
+        where = f"{quantity} beyond {q.min():g} to {with_unit(f'{q.max():g}', QUANTITIES[quantity][0])}"
+        return torch.from_numpy(np.asarray(values)).to(excess), where

@@ -23,12 +23,25 @@ from nerif.common.conventions import InputError
 from nerif.data.quantity_names import INDEX, describe
 from nerif.data.volume import Volume
 from nerif.physics.gas_optics import GAS_CONSTANT, Composition, density_from_temperature, gladstone_dale, molar_mass
-from nerif.physics.medium import check_pressure, check_temperature, check_wavelength
-from nerif.physics.plasma import critical_density
+from nerif.physics.medium import Medium, check_pressure, check_temperature, check_wavelength
+from nerif.physics.mixture import MixtureSettings
+from nerif.physics.plasma import PlasmaSettings, critical_density
 
-__all__ = ["gas_and_electrons", "two_gases"]
+__all__ = ["gas_and_electrons", "separate", "two_gases"]
 
 SAME = 1e-6  # of a determinant, relative to its terms: wavelengths that say the same
+
+
+def separate(
+    fields: Sequence[Volume], wavelengths_nm: Sequence[float], medium: Medium, stds: Sequence[Tensor] | None = None
+) -> list[Volume]:  # fmt: skip
+    """Return the two unknowns of a plasma (`gas_and_electrons`) or a mixture (`two_gases`)."""
+    if isinstance(medium, PlasmaSettings):
+        return gas_and_electrons(fields, wavelengths_nm, medium.composition, stds)
+    if isinstance(medium, MixtureSettings):
+        m = medium
+        return two_gases(fields, wavelengths_nm, m.jet, m.ambient, m.temperature_k, m.pressure_pa, stds)
+    raise InputError("expected plasma or mixture for two wavelengths, of which others have one unknown", field="medium")
 
 
 def gas_and_electrons(

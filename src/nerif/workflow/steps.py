@@ -187,7 +187,8 @@ def write_field(run: ReconstructionRun, so_far: StepOutputs) -> StepOutputs:
         field = on_grid(result.field, splines, Grid.of_resolution(result.box, run.voxels))
         volumes = all_quantities(replace(result, field=field), run.settings.substance, run.voxels)
         out.write_volumes(volumes)
-    for line in (*masked_lines(volumes), *run.settings.substance.remarks(volumes[0])):
+    medium = run.settings.substance
+    for line in (*medium.assumed(volumes[0]), *masked_lines(volumes), *medium.remarks(volumes[0])):
         say(line)
     out.write_metrics(  # without the sections of an earlier field
         Metrics(

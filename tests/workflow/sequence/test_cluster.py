@@ -453,9 +453,9 @@ def test_a_file_that_is_no_slurm_is_refused(tmp_path):
     [
         ("--workers -1", "workers: "),
         ("--chunk 0", "chunk: "),
-        ("--warm-rate 0", "warm_rate: "),
+        ("--warm-rate 0", "--warm-rate: "),
         ("--quantities pressure", "quantities: "),
-        ("--time-limit 5", "time_limit: "),
+        ("--time-limit 5", "--time-limit: "),
         ("--from images", "from: "),
         ("--refine cameras", "refine: "),
         ("--withhold nobody", "withhold: "),

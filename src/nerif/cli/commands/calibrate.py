@@ -83,9 +83,9 @@ def run(settings: Calibrate) -> None:
         _draw(rig, *_cameras(settings, box))
         return
     no_images = settings.simple or is_calibration(settings.source)
-    if settings.taken_over.interfaces is not None and (settings.simple or not no_images):
-        remedy = "calibrate first, then run nerif calibrate calibration.toml --interfaces"
-        raise InputError(f"expected together with a calibration file; {remedy}", field="interfaces")
+    if settings.taken_over.interfaces is not None and settings.simple:
+        remedy = "run nerif calibrate calibration.toml --interfaces on its result"
+        raise InputError(f"expected without --simple; {remedy}", field="interfaces")
     check_output(out, settings.force, endings=(".toml",))
     check_output(rig, True, errors)
     if settings.simple:
@@ -153,6 +153,7 @@ def _print_simple(out: Path, camera: CalibratedCamera, box: Box) -> None:
 
 def _calibrate(settings: Calibrate) -> Calibration:
     from nerif.imaging.calibration.calibrate import calibrate_views, target_images
+    from nerif.imaging.calibration.importers.importers import read_interfaces
     from nerif.imaging.readers.views import find_views
 
     views, count = find_views(settings.source, settings.views), itertools.count(1)
@@ -160,6 +161,7 @@ def _calibrate(settings: Calibrate) -> Calibration:
         return calibrate_views(
             views, settings.target, settings.method, settings.background_scale,
             settings.taken_over.background_distance, say, lambda: bar(next(count)), settings.leave_out,
+            read_interfaces(settings.taken_over.interfaces, [view.name for view in views]),
         )  # fmt: skip
 
 

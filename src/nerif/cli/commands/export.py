@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -11,7 +11,7 @@ from nerif.cli.output import counting_bar, say
 from nerif.cli.settings import Settings, command
 from nerif.common.conventions import InputError
 from nerif.common.files import ending
-from nerif.common.settings import Flat, Positional
+from nerif.common.settings import Flat, Natural, Positional
 from nerif.physics.media import MediumChanges
 from nerif.physics.medium import derive, masked_lines
 
@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from nerif.geometry import Box, Grid
 
 __all__ = ["Export", "main", "run"]
+
+VOXELS = 100  # where a result does not say how many
 
 
 @dataclass(frozen=True)
@@ -41,8 +43,11 @@ class Export(Settings):
     not the temperature of a gas)."""
     frame: int | None = None
     """Frame of volumes over time, counted from 0, on their own voxels (default: all, with .pvd or .dat)."""
-    voxels: int = 100
-    """Voxels along the longest edge."""
+    second: Path | None = None
+    """Result of the same flow at another wavelength, for two unknowns: with --medium plasma density and electron
+    density, with --medium mixture temperature and mole fraction (docs/media.md)."""
+    voxels: Natural = 0
+    """Voxels along the longest edge; 0: as many as the volumes of the result."""
     shape: tuple[int, int, int] | None = None
     """Voxels along z y x, instead of --voxels."""
     lower: tuple[float, float, float] | None = None
@@ -62,6 +67,7 @@ def run(settings: Export) -> None:
     from nerif.data.velocity_sequence import open_volumes
     from nerif.data.volume import FORMATS, export
     from nerif.results.directory import ResultDirectory
+    from nerif.results.two_unknowns import two_unknowns
 
     over_time = ending(settings.result) == ".zarr"
     endings = (*FORMATS, *(FOLDER_FORMATS if over_time else ()))
@@ -86,7 +92,13 @@ def run(settings: Export) -> None:
         raise InputError("expected volumes over time (.zarr) with --frame", field="frame")
     result = ResultDirectory(settings.result)
     (_, whole, _), quantity = result.field(), result.quantity()
-    grid = _grid(settings, whole)
+    grid = _grid(replace(settings, voxels=settings.voxels or result.settings().get("voxels", 0)), whole)
+    if settings.second is not None:
+        with counting_bar("sampling the fields"):
+            volumes = two_unknowns([result, ResultDirectory(settings.second)], grid, settings.medium.of({}))
+        export(settings.out, volumes, settings.force)
+        say(f"{settings.out}: {', '.join(v.quantity for v in volumes)}")
+        return
     with counting_bar("sampling the field"):
         reconstruction, medium = result.sample(grid), settings.medium.of(result.settings())
     absent = medium.absent(reconstruction)
@@ -98,7 +110,7 @@ def run(settings: Export) -> None:
     export(settings.out, volumes, settings.force)
     names = ", ".join(v.quantity for v in volumes)
     say(f"{settings.out}: {names} on {' x '.join(map(str, grid.shape))} voxels (z, y, x)")
-    for line in (*masked_lines(volumes), *medium.remarks(reconstruction)):
+    for line in (*medium.assumed(reconstruction), *masked_lines(volumes), *medium.remarks(reconstruction)):
         say(line)
 
 
@@ -112,7 +124,7 @@ def _grid(settings: Export, whole: Box) -> Grid:
             f"expected a part of the box {whole.lower} to {whole.upper} mm, got {box.lower} to {box.upper}",
             field="lower, upper",
         )
-    return Grid(box, settings.shape) if settings.shape else Grid.of_resolution(box, settings.voxels)
+    return Grid(box, settings.shape) if settings.shape else Grid.of_resolution(box, settings.voxels or VOXELS)
 
 
 main = command("export", Export, run)

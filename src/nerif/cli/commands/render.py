@@ -13,8 +13,8 @@ from nerif.common.conventions import AMBIENT_INDEX
 from nerif.common.installation import command_line, word_of
 from nerif.common.interruption import if_interrupted
 from nerif.common.settings import Flat
-from nerif.geometry.rig import Ring
 from nerif.simulation.experiment_settings import ExperimentSettings
+from nerif.simulation.simulated_rig import SimulatedRig
 
 __all__ = ["Render", "main", "run"]
 
@@ -38,14 +38,12 @@ class Render(Settings):
     """Edges of the box, centred on the origin, along x y z, mm."""
     n_ambient: float = AMBIENT_INDEX
     """Refractive index around the flow."""
-    f_number: float = 0.0
-    """f-number of the lenses, focused on the backgrounds (0: pinholes)."""
     truth_voxels: int = 100
     """Voxels of the true field along the longest edge."""
     force: bool = False
     """Write into a folder that is not empty."""
     images: Annotated[ExperimentSettings, Flat] = field(default_factory=ExperimentSettings)
-    ring: Annotated[Ring, Flat] = field(default_factory=Ring)
+    rig: Annotated[SimulatedRig, Flat] = field(default_factory=SimulatedRig)
 
 
 def run(settings: Render) -> None:
@@ -57,7 +55,7 @@ def run(settings: Render) -> None:
 
     directory = ResultDirectory(settings.out)
     directory.check_free(settings.force)
-    cameras, images = settings.ring.cameras(settings.f_number), Experiment(**vars(settings.images))
+    cameras, images = settings.rig.cameras(), Experiment(**vars(settings.images))
     box = Box.around_origin(settings.box)
     phantom = make_phantom(settings.phantom, box, settings.phantom_seed)
     count = itertools.count(1)
@@ -69,9 +67,14 @@ def run(settings: Render) -> None:
             lambda: bar(next(count)),
         )  # fmt: skip
     say(f"{settings.out}: images of {len(cameras)} views, {images.sensor.bits} bit")
-    say(f"target: {images.target_for(cameras).label}")
-    words = ["calibrate", word_of(settings.out), "--config", word_of(settings.out / "calibrate.toml")]
-    say(f"next: {command_line([*words, '-o', 'calibration.toml'])}")
+    if images.poses:
+        say(f"target: {images.target_for(cameras).label}")
+        words = ["calibrate", word_of(settings.out), "--config", word_of(settings.out / "calibrate.toml")]
+        words += ["-o", "calibration.toml"]
+    else:
+        truth = word_of(settings.out / "truth" / "calibration.toml")
+        words = ["displacement", word_of(settings.out), "--calibration", truth, "-o", "measurement.nc"]
+    say(f"next: {command_line(words)}")
 
 
 main = command("render", Render, run)

@@ -13,7 +13,7 @@ from nerif.common.conventions import InputError, with_unit
 from nerif.common.interruption import if_interrupted
 from nerif.common.locks import locked
 from nerif.common.settings import Flat
-from nerif.geometry.rig import Ring
+from nerif.simulation.simulated_rig import SimulatedRig
 from nerif.simulation.simulation import Simulation
 
 __all__ = ["Simulate", "main", "run"]
@@ -27,12 +27,10 @@ class Simulate(Settings):
     """Measurement to write, NAME.nc, with the true field NAME.truth.nc; .zarr instead of .nc with --times."""
     times: str = ""
     """Instants of a sequence of the flame, FIRST:LAST:COUNT in s, such as 0:2.3e-3:24."""
-    f_number: float = 0.0
-    """f-number of the lenses, focused on the backgrounds (0: thin rays)."""
     force: bool = False
     """Overwrite existing files."""
     simulation: Annotated[Simulation, Flat] = field(default_factory=Simulation)
-    ring: Annotated[Ring, Flat] = field(default_factory=Ring)
+    rig: Annotated[SimulatedRig, Flat] = field(default_factory=SimulatedRig)
 
 
 def truth_path(out: Path) -> Path:
@@ -47,7 +45,7 @@ def run(settings: Simulate) -> None:
     out, truth = settings.out, truth_path(settings.out)
     times = instants(settings.times) if settings.times else ()
     check_output(out, settings.force, truth, endings=(".zarr",) if times else (".nc",))
-    cameras = settings.ring.cameras(settings.f_number)
+    cameras = settings.rig.cameras()
     if times:
         remedy = f"{out} and {truth} lack frames; run the same command with --force to start again"
         with locked(out), if_interrupted(lambda: remedy), counting_bar("simulating frames") as bar:

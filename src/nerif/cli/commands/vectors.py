@@ -94,6 +94,11 @@ def run(settings: Vectors) -> Measurement:
     with counting_bar("reading vectors", len(vectors.views)) as bar:
         measurement, noise = vectors.measure(range(settings.frame, settings.frame + settings.average), bar)
     measurement.write(out)
+    if len(vectors) > settings.average:
+        say(
+            f"note: {settings.average} of {len(vectors)} frames, from number {settings.frame} on; --average takes the "
+            "mean of more, and --out NAME.zarr writes the film"
+        )
     if note := vectors.smaller_grids(measurement):
         say(f"note: {note}")
     say("displacements in pixels of the views, which are steps of the grid:")

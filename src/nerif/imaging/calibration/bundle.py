@@ -2,7 +2,8 @@
 
     minimise  sum rho(|pixel - project_i(R_i (R_j X + t_j) + t_i)|^2),      rho Huber's loss
 
-over cameras i and target poses j; one pose is fixed and defines the world. Weak priors hold the parameters that a
+over cameras i and target poses j; one pose is fixed and defines the world. Windows between a camera and the targets
+refract (geometry/interfaces.py); their planes are fixed in the world. Weak priors hold the parameters that a
 narrow lens does not separate from a rotation: the principal point near the middle of the image, distortion near 0.
 Without distortion, a tilt of the sensor is exactly a rotation of the camera, a shift of the principal point and a
 shorter focal length; then the prior of that point determines it.
@@ -20,10 +21,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 from jaxtyping import Float
 
-from nerif.geometry import PERSPECTIVE, Projection
+from nerif.geometry import PERSPECTIVE, Camera, Projection
 from nerif.geometry.distortion import POWERS, distort, tilt, tilt_slopes
+from nerif.geometry.interfaces import Interface
 from nerif.imaging.calibration.targets import Detection
 
 __all__ = ["INTRINSIC", "CameraBundle", "Pose", "TargetObservation", "adjust", "crossing"]
@@ -106,34 +109,30 @@ class CameraBundle:
     free: tuple[bool, ...]  #: (11,) which intrinsics are adjusted
     sizes: tuple[tuple[int, int], ...]  #: (height, width) of each camera's images, px
     projection: Projection = PERSPECTIVE
+    interfaces: tuple[tuple[Interface, ...], ...] = ()  #: of each camera, in the bundle's world; () without any
 
     def project(self, o: TargetObservation) -> Float[np.ndarray, "n 2"]:
         """Return the points of an observation by the model, px."""
-        k, pose = self.intrinsics[o.camera], self.cameras[o.camera] @ self.poses[o.pose]
-        image = self.projection.image(pose.apply(o.detection.points))
+        k, points = self.intrinsics[o.camera], self.poses[o.pose].apply(o.detection.points)
+        if planes := self._planes(o.camera):
+            image = self._behind(o.camera, planes).image_point(torch.from_numpy(points)).numpy()
+        else:
+            image = self.projection.image(self.cameras[o.camera].apply(points))
         x, y, _ = tilt(*distort(image[:, 0], image[:, 1], k[4:9])[:2], k[9:])
         return np.stack([k[0] * x + k[2], k[1] * y + k[3]], axis=1)
 
     def derivatives(self, o: TargetObservation) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the derivatives (2 n, p) of u, v of each point by intrinsics, camera pose and target pose."""
-        import cv2
-
-        k, points = self.intrinsics[o.camera], o.detection.points
-        a, b = self.poses[o.pose].vector, self.cameras[o.camera].vector
-        r, t, drda, drdta, drdb, drdtb, dtda, dtdta, dtdb, dtdtb = cv2.composeRT(a[:3], a[3:], b[:3], b[3:])
-        rotation, turn = cv2.Rodrigues(r)
-        local = points @ rotation.T + t.ravel()
-        image, slope = self.projection.image(local), self.projection.slope
+        k, pose = self.intrinsics[o.camera], self.poses[o.pose]
+        turned = o.detection.points @ pose.rotation.T
+        image, slope, by_camera = self._image_slopes(o.camera, turned + pose.translation)
         x, y = image.T
         xd, yd, (xx, cross, yy) = distort(x, y, k[4:9])
         xt, yt, slopes = tilt(xd, yd, k[9:])
         by_distorted = k[:2, None] * _rows(*slopes)
         by_image = by_distorted @ _rows(xx, cross, cross, yy)
-        by_place = np.stack([
-            np.stack(slope(by_image[:, i, 0], by_image[:, i, 1], image, local), axis=-1) for i in range(2)
-        ], axis=1)  # fmt: skip
-        by_turn = by_place @ np.tensordot(points, turn.reshape(3, 3, 3), axes=(1, 2)).transpose(0, 2, 1)
-        by_joint = np.concatenate([by_turn, by_place], axis=-1).reshape(-1, POSE)
+        by_place = by_image @ slope
+        by_pose = np.concatenate([by_place @ _turning(turned, pose), by_place], axis=-1).reshape(-1, POSE)
         r2, zero, one = x * x + y * y, np.zeros_like(x), np.ones_like(x)
         coefficients = _rows(
             x * r2, x * r2**2, 2 * x * y, r2 + 2 * x * x, x * r2**3,
@@ -144,8 +143,38 @@ class CameraBundle:
             by_distorted @ coefficients,
             k[:2, None] * _rows(*tilt_slopes(xd, yd, k[9:])),
         ], axis=-1).reshape(-1, INTRINSIC)  # fmt: skip
-        by_camera = by_joint @ np.block([[drdb, drdtb], [dtdb, dtdtb]])
-        return by_intrinsics, by_camera, by_joint @ np.block([[drda, drdta], [dtda, dtdta]])
+        return by_intrinsics, (by_image @ by_camera).reshape(-1, POSE), by_pose
+
+    def _image_slopes(self, i: int, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return (x, y) of points (n, 3) of the world, and its slopes (n, 2, 3) by the point, (n, 2, 6) by the pose."""
+        camera = self.cameras[i]
+        if planes := self._planes(i):
+            behind, place = self._behind(i, planes), torch.from_numpy(points)
+            image = behind.image_point(place)
+            line = behind.line(image, motions=True)
+            by_turn, by_shift = line.motion_slope(place).numpy().reshape(-1, 2, 2, 3).transpose(2, 0, 1, 3)
+            back = -camera.rotation.T  # of a camera x -> R x + t: its motion in the world is -R^T (T dv), -R^T dt
+            by_camera = np.concatenate([by_turn @ back @ camera.rotation_jacobian, by_shift @ back], axis=-1)
+            return image.numpy(), line.image_slope(place).numpy(), by_camera
+        turned = points @ camera.rotation.T
+        local = turned + camera.translation
+        image, unit = self.projection.image(local), np.eye(2)[..., None].repeat(len(local), axis=-1)
+        rows = [np.stack(self.projection.slope(u, v, image, local), axis=-1) for u, v in unit]
+        by_local = np.stack(rows, axis=1)
+        by_camera = np.concatenate([by_local @ _turning(turned, camera), by_local], axis=-1)
+        return image, by_local @ camera.rotation, by_camera
+
+    def _planes(self, i: int) -> tuple[Interface, ...]:
+        return self.interfaces[i] if self.interfaces else ()
+
+    def _behind(self, i: int, planes: tuple[Interface, ...]) -> Camera:
+        """The camera with its windows, for (x, y)."""
+        rotation, shift = (torch.from_numpy(a.copy()) for a in (self.cameras[i].rotation, self.cameras[i].translation))
+        unit = torch.eye(3, dtype=torch.float64)
+        return Camera(
+            unit, rotation, shift, self.sizes[i], None, torch.zeros(5, dtype=torch.float64), projection=self.projection,
+            interfaces=planes,
+        )  # fmt: skip
 
     def residual(self, o: TargetObservation) -> Float[np.ndarray, "n 2"]:
         """Return detected minus projected points, px."""
@@ -201,6 +230,14 @@ def crossing(vector: Float[np.ndarray, 3]) -> Float[np.ndarray, "3 3"]:
     """Return [v]x, by which v x a = [v]x a."""
     x, y, z = vector
     return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+
+
+def _turning(turned: Float[np.ndarray, "n 3"], pose: Pose) -> Float[np.ndarray, "n 3 3"]:
+    """Return the derivatives of R x (n, 3) by the rotation vector of a pose: d(R x) = (T dv) x (R x)."""
+    x, y, z = turned.T
+    zero = np.zeros_like(x)
+    cross = np.stack([zero, z, -y, -z, zero, x, y, -x, zero], axis=-1).reshape(-1, 3, 3)
+    return cross @ pose.rotation_jacobian
 
 
 def _rows(*columns: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 2 m"]:

@@ -7,14 +7,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
+import torch
 from jaxtyping import Float
 
 from nerif.common.conventions import InputError
 from nerif.common.files import check_known
+from nerif.geometry.interfaces import Interface
 from nerif.imaging.calibration.bundle import CameraBundle, Pose, TargetObservation, adjust, crossing
 from nerif.imaging.calibration.calibration_settings import CalibrationSettings
 from nerif.imaging.calibration.first_guess import first_guess, mirror
@@ -40,6 +42,7 @@ def calibrate_views(
     say: Callable[[str], None] = lambda text: None,
     on_image: Callable[[], None] = lambda: None,
     leave_out: Sequence[str] = (),
+    interfaces: Mapping[str, tuple[Interface, ...]] = {},
 ) -> Calibration:  # fmt: skip
     """Detect a target in the images of all views, and calibrate their cameras.
 
@@ -50,6 +53,7 @@ def calibrate_views(
     background_distance : as in `calibrate`
     say : receives a note on each image without a detection
     on_image : called after each of the `target_images`
+    interfaces : as in `calibrate`
     leave_out : images not to use, such as cam1/target/7 or cam1/background/2: view, source and pose
     """
     background_target = target.scaled(background_scale)
@@ -58,7 +62,7 @@ def calibrate_views(
     images = [f"{v.name}/{s}/{p}" for v in views for s in SOURCES if s in v.sources for p in pose_names(v.open(s))]
     check_known(leave_out, images, "leave_out", "image")
     detections = [find_targets(view, target, say, on_image, background_target).without(leave_out) for view in views]
-    return calibrate(detections, settings, background_distance)
+    return calibrate(detections, settings, background_distance, interfaces)
 
 
 def target_images(views: Sequence[View]) -> int:
@@ -70,6 +74,7 @@ def calibrate(
     views: Sequence[TargetDetections],
     settings: CalibrationSettings = STANDARD,
     background_distance: float | None = None,
+    interfaces: Mapping[str, tuple[Interface, ...]] = {},
 ) -> Calibration:  # fmt: skip
     """Calibrate all cameras from the detections in their images.
 
@@ -80,6 +85,7 @@ def calibrate(
     ----------
     background_distance : of backgrounds without images of a target on them (telecentric cameras: of all), from the
         origin and across the optical axis, mm; None: unknown planes
+    interfaces : windows through which cameras saw the targets, by the cameras' names, in the world of the settings
     """
     if not views:
         raise InputError("expected one folder of target images per camera, got no view", field="calibrate")
@@ -89,15 +95,38 @@ def calibrate(
         views = [replace(v, background={}) for v in views]
     bundle, observations = first_guess(views, settings.coefficients, settings.world, settings.kind)
     bundle, _ = adjust(bundle, observations, INITIAL_NOISE)
+    if interfaces:
+        bundle, _ = adjust(_behind(bundle, interfaces, names, settings), observations, INITIAL_NOISE)
     fits = _fits(bundle, observations)
     consistent = [o for o, fit in zip(observations, fits, strict=True) if fit]
     _check_counts(views, consistent)
     noise = float(np.median([bundle.rms(o) for o in consistent])) / np.sqrt(2)
     bundle, covariance = adjust(bundle, consistent, max(noise, MIN_NOISE))
     bundle, covariance = _to_world(_on_side(bundle, settings, names), covariance, settings)
+    bundle = replace(bundle, interfaces=tuple(interfaces.get(name, ()) for name in names) if interfaces else ())
     result = Calibration.of(names, bundle, covariance, observations, fits, background_distance)
     result.check(settings.max_error)
     return result
+
+
+def _behind(
+    bundle: CameraBundle, interfaces: Mapping[str, tuple[Interface, ...]], names: Sequence[str],
+    settings: CalibrationSettings,
+) -> CameraBundle:  # fmt: skip
+    """The bundle with windows, in the frame of the fixed target, which the result moves to the world."""
+    if not bundle.projection.shows_depth:
+        raise InputError(
+            "expected perspective cameras for windows in front of targets, got telecentric", field="interfaces"
+        )
+    rotation, origin = torch.from_numpy(settings.rotation), torch.tensor(settings.origin, dtype=torch.float64)
+    moved = tuple(
+        tuple(
+            Interface(rotation.T @ plane.normal, plane.offset - float(plane.normal @ origin), plane.index)
+            for plane in interfaces.get(name, ())
+        )
+        for name in names
+    )
+    return replace(bundle, interfaces=moved)
 
 
 def _fits(bundle: CameraBundle, observations: Sequence[TargetObservation]) -> list[bool]:

@@ -196,8 +196,9 @@ class ImportSettings:
     """Standard deviation of the camera rotations, degrees; default with target images: 0.005 in addition to their
     noise; with --simple: 0.5."""
     interfaces: Path | None = None
-    """File .toml of windows between cameras and flow that were not there during the calibration: tables [[interface]]
-    with normal, offset (mm), index and, if not of all cameras, views."""
+    """File .toml of windows between cameras and flow, through which the target images were taken, or which were not
+    there when the calibration file was made: tables [[interface]] with normal, offset (mm), index and, if not of all
+    cameras, views."""
 
     def __post_init__(self) -> None:
         if self.focus_distance is not None and self.aperture_diameter is None:

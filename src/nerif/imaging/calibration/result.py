@@ -15,6 +15,7 @@ from nerif.common.conventions import InputError
 from nerif.common.files import read_toml
 from nerif.data.cameras_file import CalibratedCamera, write_cameras
 from nerif.geometry import PERSPECTIVE, Box, Lens, Plane, Projection
+from nerif.geometry.interfaces import Interface
 from nerif.imaging.calibration.bundle import INTRINSIC, CameraBundle, Pose, TargetObservation, crossing
 
 __all__ = ["MOUNT", "Calibration", "FittedPlane", "ImageError", "read_errors", "rms_of"]
@@ -110,6 +111,7 @@ class Calibration:
     residuals: tuple[np.ndarray, ...]  #: per camera (n, 4) u, v and the residuals in u, v, px
     projection: Projection = PERSPECTIVE
     lens: Lens | None = None
+    interfaces: tuple[tuple[Interface, ...], ...] = ()  #: windows of each camera, world frame
     pose_sigma: Float[np.ndarray, "camera 6"] | None = None
     """(camera, 6) of a Camera, from noise alone and for the tilt as it is, or None."""
     mount: tuple[float, float] = MOUNT
@@ -153,6 +155,7 @@ class Calibration:
             sigma_tilt=np.degrees(sigma[:, 9:INTRINSIC]),
             residuals=tuple(residuals),
             projection=bundle.projection,
+            interfaces=bundle.interfaces,
             pose_sigma=np.stack([_pose_sigma(*one) for one in zip(bundle.cameras, poses, strict=True)]),
         )
 
@@ -185,6 +188,7 @@ class Calibration:
             lens=self.lens,
             pose_sigma=None if self.pose_sigma is None else torch.from_numpy(np.hypot(self.pose_sigma[i], mount)),
             tilt=torch.from_numpy(self.intrinsics[i, 9:].copy()),
+            interfaces=self.interfaces[i] if self.interfaces else (),
         )
 
     @property

@@ -72,6 +72,7 @@ class ProgramVectors:
     sigma: Float[np.ndarray, "n 2"] | None = None  #: standard deviation in the unit of the vectors
     window: float = 0.0  #: px; 0 if unknown
     first_pixel: tuple[float, float] | None = None  #: x, y of its centre, px; None: as the program's
+    replaced: str = ""  #: what the file says and the user states otherwise
 
     @classmethod
     def of_maps(
@@ -89,7 +90,21 @@ class ProgramVectors:
             "time_step": settings.time_step, "origin": settings.origin, "window": settings.window,
         }  # fmt: skip
         stated = replace(self, **{name: value for name, value in changes.items() if value})
-        return replace(stated, y_up=settings.y_axis == "up") if settings.y_axis else stated
+        units = {stated.position_unit, stated.vector_unit}
+        needless = {
+            "scale": settings.scale and units == {"px"}, "time_step": settings.time_step and not units & {*RATES},
+            "origin": settings.origin is not None and stated.position_unit == "px",
+        }  # fmt: skip
+        for name, refused in needless.items():
+            if refused:
+                what = f"positions in {stated.position_unit} and vectors in {stated.vector_unit}"
+                raise InputError(
+                    f"expected none for {what}; omit it, or give --position-unit and --vector-unit", field=name
+                )
+        up = settings.y_axis == "up" if settings.y_axis else self.y_up
+        numbers = {name: getattr(self, name) for name in ("scale", "time_step")}
+        others = [f"{name} {value:.5g}" for name, value in numbers.items() if value and value != getattr(stated, name)]
+        return replace(stated, y_up=up, replaced=" and ".join(others).replace("_", " "))
 
     @property
     def words(self) -> str:
@@ -99,7 +114,8 @@ class ProgramVectors:
         step = f", {self.time_step:g} s between the images" if self.time_step and self.vector_unit in RATES else ""
         return (
             f"vectors of {self.program.name}: x and y in {self.position_unit}, u and v in {self.vector_unit}"
-            f"{scale}{step}, y and v {'up' if self.y_up else 'down'}, the first pixel at {self.program.first_pixel:g}"
+            f"{scale}{step}{f' (in the file {self.replaced})' if self.replaced else ''}, "
+            f"y and v {'up' if self.y_up else 'down'}, the first pixel at {self.program.first_pixel:g}"
         )
 
     def map(self, height: int | None, place: object, flow_first: bool = False) -> VectorMap:

@@ -147,6 +147,8 @@ class VectorMap:
         change = torch.diag(torch.tensor([1 / self.step[0], 1 / self.step[1], 1.0], dtype=torch.float64))
         change[:2, 2] = -torch.tensor(self.origin, dtype=torch.float64) * change.diagonal()[:2]
         window = self.windowed / self.pixel
+        if self.window > min(n * s for n, s in zip((columns, rows), self.step, strict=True)):
+            raise InputError(f"expected less than the edge of the images, got {self.window:g} px", field="window")
         if window > MAX_WINDOW:
             raise InputError(
                 f"expected at most {MAX_WINDOW:g} steps of {self.pixel:.3g} px, got {self.windowed:g} px",

@@ -15,6 +15,7 @@ import numpy as np
 
 from nerif.common.conventions import InputError
 from nerif.common.files import ending
+from nerif.common.image_names import FOLDER_SUFFIXES
 from nerif.data.cameras_file import CalibratedCamera
 from nerif.data.measurement import Measurement
 from nerif.data.measurement_sequence import MeasurementSequence, check_instants
@@ -276,7 +277,9 @@ def _frames_by_view(source: Path, settings: VectorSettings, cameras: Sequence[st
         return {name: (partial(_same, vectors),) for name, vectors in zip(cameras, maps, strict=True)}
     files = {name: paths for name, paths in _files(source, cameras).items() if paths}
     if not files:
-        raise InputError(f"expected files of vectors ({' '.join(ENDINGS)}) for each view, got none", field=source)
+        images = any(ending(path) in FOLDER_SUFFIXES for path in (*source.glob("*"), *source.glob("*/*")))
+        got = "images; nerif displacement evaluates those" if images else "none"
+        raise InputError(f"expected files of vectors ({' '.join(ENDINGS)}) for each view, got {got}", field=source)
     return {name: tuple(f for path in paths for f in _of_file(path, settings)) for name, paths in files.items()}
 
 

@@ -12,6 +12,7 @@ from nerif.common.settings import Count, Positive
 from nerif.data.quantity_names import INDEX, QUANTITIES
 from nerif.physics.media import MEDIA, MediumSettings
 from nerif.reconstruction.neural.neural import NeRIF
+from nerif.workflow.run_settings import NONE
 
 if TYPE_CHECKING:
     from nerif.data.measurement import Measurement
@@ -34,7 +35,7 @@ class SequenceSettings(MediumSettings):
     warm_rate: Positive = 0.7
     """Initial learning rate of such a frame, relative to the full one."""
     withhold: tuple[str, ...] = ()
-    """Withheld views, compared with the reconstruction."""
+    """Withheld views, compared with the reconstruction (default, or none: no view)."""
     voxels: Count = 100
     """Voxels of the volumes along the longest edge of the box."""
     quantities: tuple[str, ...] = ()
@@ -43,6 +44,8 @@ class SequenceSettings(MediumSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.withhold == NONE:
+            object.__setattr__(self, "withhold", ())
         for quantity in self.quantities:
             if quantity not in QUANTITIES:
                 raise InputError(f"expected some of {', '.join(QUANTITIES)}, got '{quantity}'", field="quantities")

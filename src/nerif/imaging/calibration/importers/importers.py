@@ -30,7 +30,7 @@ from nerif.imaging.calibration.importers.yaml_files import ENDINGS as YAML
 from nerif.imaging.calibration.importers.yaml_files import read_yaml_files
 from nerif.imaging.readers.views import VIEWS
 
-__all__ = ["import_box", "import_cameras", "is_calibration"]
+__all__ = ["import_box", "import_cameras", "is_calibration", "read_interfaces"]
 
 STANDARD = ImportSettings()
 READERS = {".toml": read_tables, ".json": read_transforms}
@@ -72,14 +72,14 @@ def import_cameras(
     names = [c.name for c in cameras]
     check_known(only, names, "views", "camera", f" of {', '.join(names)}")
     settings = replace(settings, scale_mm=settings.scale_mm or unit)
-    interfaces = _interfaces(settings.interfaces, names)
+    interfaces = read_interfaces(settings.interfaces, names)
     completed = (_completed(c, settings) for c in cameras if not only or c.name in only)
     return tuple(
         check_camera(replace(c, interfaces=interfaces.get(c.name, c.interfaces)), str(path)) for c in completed
     )
 
 
-def _interfaces(path: Path | None, names: Sequence[str]) -> dict[str, tuple[Interface, ...]]:
+def read_interfaces(path: Path | None, names: Sequence[str]) -> dict[str, tuple[Interface, ...]]:
     """Return the interfaces of cameras by name, in order from the camera."""
     result: dict[str, tuple[Interface, ...]] = {}
     if path is None:
