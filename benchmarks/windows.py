@@ -48,10 +48,9 @@ WALLS = {
 
 def cases(quick: bool) -> Iterator[Settings]:
     size = {"pixels": 24, "steps": 60} if quick else {"pixels": 64, "steps": 300}
-    for seed in (0,) if quick else (0, 1):
-        for walls in ("upright", "tilted"):
-            yield {"flow": "flame", "medium": 1.00027, "walls": walls, **size, "seed": seed}
-        yield {"flow": "plume", "medium": 1.333, "walls": "tank", **size, "seed": seed}
+    for walls in ("tilted",) if quick else ("upright", "tilted"):
+        yield {"flow": "flame", "medium": 1.00027, "walls": walls, **size, "seed": 0}
+    yield {"flow": "plume", "medium": 1.333, "walls": "tank", **size, "seed": 0}
 
 
 def walled_rig(wall: Wall, pixels: int, medium: float) -> tuple[Camera, ...]:

@@ -36,6 +36,7 @@ __all__ = ["ATTEMPTS", "FAILURES", "FrameError", "end_without", "finished_frame"
 
 ATTEMPTS = 3
 SCORE_PIXELS, SCORE_SAMPLES = 256, 60  # pixels per view, and samples per ray, of the scores of a frame
+LENS_PIXELS = 64  # of them where a pixel is the mean over several rays
 
 FAILURES = (InputError, ArithmeticError, RuntimeError, MemoryError, OSError)
 """Errors of a frame that justify another attempt; any other fails the chunk (run.py)."""
@@ -122,11 +123,12 @@ def _scores(model: str, field: Field, measurement: Measurement, device: str) -> 
         kind = observation.technique
         projector = PathIntegral(forward_model(kind, measurement, model), SCORE_SAMPLES)
         rays, values, _ = measurement.rays(observation)
+        pixels = SCORE_PIXELS if rays.lens is None else LENS_PIXELS
         for i, name in enumerate(measurement.names):
             index = (rays.view == i).nonzero()[:, 0]
             if not len(index):
                 continue
-            index = index[:: max(1, len(index) // SCORE_PIXELS)]
+            index = index[:: max(1, len(index) // pixels)]
             predicted = project(projector, field, rays[index], device).numpy()
             view = values[index].numpy()
             rms = float(np.sqrt(np.mean((view - predicted) ** 2)))
