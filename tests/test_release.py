@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import re
+import runpy
+import sys
 import tomllib
 from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, requires
@@ -26,6 +29,59 @@ def test_citation_and_changelog_name_the_version_and_its_date() -> None:
     assert sections[:2] == ["[Unreleased]", f"[{nerif.__version__}] - {citation['date-released']}"]
     kinds = set(re.findall(r"^### (.*)$", changelog, flags=re.MULTILINE))
     assert kinds <= {"Added", "Changed", "Deprecated", "Removed", "Fixed", "Security"}
+
+
+def test_citation_and_zenodo_agree_with_the_package() -> None:
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    zenodo = json.loads((ROOT / ".zenodo.json").read_text(encoding="utf-8"))
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert citation["version"] == zenodo["version"] == nerif.__version__
+    assert str(citation["date-released"]) == zenodo["publication_date"]
+    assert citation["title"] == zenodo["title"] == next(iter(project["scripts"]))
+    # the licence of the code; sample data have theirs beside them
+    assert citation["license"] == zenodo["license"] == project["license"].split(" AND ")[0]
+    names = [author["name"] for author in project["authors"]]
+    assert [author["name"] for author in citation["authors"]] == names
+    assert [creator["name"] for creator in zenodo["creators"]] == names
+    assert citation["keywords"] == zenodo["keywords"]
+    assert citation["abstract"].rstrip(".") in zenodo["description"]
+    assert citation["preferred-citation"]["doi"] == zenodo["related_identifiers"][0]["identifier"]
+
+
+PAPER = ROOT / "paper"
+SECTIONS = """Summary, Statement of need, State of the field, Software design, Research impact statement,
+AI usage disclosure, Acknowledgements, References"""
+
+
+def test_the_paper_has_the_form_of_joss() -> None:
+    """Words: within the journal's former limits, 250 to 1000, and its present ones, 750 to 1750."""
+    _, head, body = (PAPER / "paper.md").read_text(encoding="utf-8").split("---\n", 2)
+    metadata = yaml.safe_load(head)
+    assert metadata["bibliography"] == "paper.bib"
+    assert {"title", "tags", "authors", "affiliations", "date"} <= set(metadata)
+    indices = {affiliation["index"] for affiliation in metadata["affiliations"]}
+    assert {author["affiliation"] for author in metadata["authors"]} <= indices
+    assert re.fullmatch(r"\d{1,2} [A-Z][a-z]+ 20\d\d", metadata["date"])
+    assert re.findall(r"^# (.*)$", body, flags=re.MULTILINE) == re.split(r",\s", SECTIONS)
+    assert 750 <= sum(any(map(str.isalnum, word)) for word in body.split()) <= 1000
+
+    bibliography = (PAPER / "paper.bib").read_text(encoding="utf-8")
+    keys = re.findall(r"^@\w+\{(\w+),$", bibliography, flags=re.MULTILINE)
+    assert len(keys) == len(set(keys)) == bibliography.count("\n@") + bibliography.startswith("@")
+    assert set(re.findall(r"(?<![\w.])@(\w+)", body)) == set(keys)
+
+    labels = re.findall(r"\\label\{(\w+)\}", body)
+    assert set(re.findall(r"\\autoref\{(\w+)\}", body)) == set(labels)
+    [figure] = re.findall(r"^!\[[^\]]*\]\((\S+)\)$", body, flags=re.MULTILINE)
+    assert 10_000 < (PAPER / figure).stat().st_size < 300_000
+
+
+@pytest.mark.slow
+def test_the_figure_of_the_paper_is_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    out = tmp_path / "figure.png"
+    monkeypatch.setattr(sys, "argv", ["figure.py", str(out), "16", "10", "12"])
+    runpy.run_path(str(PAPER / "figure.py"), run_name="__main__")
+    assert out.read_bytes().startswith(b"\x89PNG")
 
 
 def test_the_corpus_has_files_of_the_version() -> None:

@@ -14,10 +14,10 @@ WORDS = """\\btold|\\basked|\\bis met|\\bare met|goes? by\\b|what (is|was) (foun
 |picture|as it is given|no sign\\b|(?<!cannot )\\btells?\\b|\\bsays? so|by itself|\\bmend(s|ed)?\\b|so many|\\balike\\b
 |\\bsomebody\\b|what came\\b|an eye on|of its own accord"""
 NAMES = "found seen kept own told asked known given said shown chosen drawn held meant taken".split()  # noqa: SIM905
-FOLDERS = "src", "examples", "benchmarks", "tests"
+FOLDERS = "src", "examples", "benchmarks", "paper", "tests"
 SOURCES = sorted(p for folder in FOLDERS for p in (ROOT / folder).rglob("*.py") if p != Path(__file__))
 DOCS = [p for p in (ROOT / "docs").rglob("*.md") if not {"repository", "_build"} & {*p.parts}]  # made by Sphinx
-PAGES = sorted([*ROOT.glob("*.md"), *DOCS, ROOT / "benchmarks" / "README.md"])
+PAGES = sorted([*ROOT.glob("*.md"), *DOCS, ROOT / "benchmarks" / "README.md", ROOT / "paper" / "paper.md"])
 
 
 @pytest.mark.parametrize("path", [*SOURCES, *PAGES], ids=lambda path: str(path.relative_to(ROOT)))
