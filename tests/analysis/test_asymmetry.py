@@ -130,7 +130,8 @@ def test_a_flow_that_is_not_axisymmetric_is_not_to_be_used(tmp_path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [(["--symmetry", "round"], "symmetry: expected none, axis"),
-     (["--symmetry", "axis", "--axis-point", "90", "0", "0", "--method", "tv"], "--axis-point: expected the axis within"),
+     (["--symmetry", "axis", "--axis-point", "90", "0", "0", "--method", "tv"],
+      "--axis-point: expected the axis within"),
      (["--withhold", "left"], "withhold: expected half an image"),
      ([*QUICK, "--symmetry", "axis+1"], "symmetry: expected 2 views or more for axis+1")],
 )  # fmt: skip

@@ -35,6 +35,20 @@ def test_it_is_the_field_around_the_axis():
     assert line[0] == pytest.approx(float(phantom(torch.tensor([[0.0, 0.0, 3.1]], dtype=torch.float64))), rel=0.02)
 
 
+def test_it_is_missing_where_most_azimuths_are():
+    """A sector of 216 of 360 degrees without values leaves none around the axis; one of 144 degrees leaves all."""
+    grid = Grid.of_resolution(Box.cube(20.0), 20)
+    symmetry = Symmetry.about("axis", (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), 0.01)
+    x, y, _ = grid.points().unbind(-1)
+    for degrees, missing in ((216, True), (144, False)):
+        values = x.new_ones(x.shape).masked_fill(y.atan2(x).rad2deg() % 360 < degrees, np.nan)
+        volume = Volume.of(values, grid, "index_excess", 1.00027)
+        meridian = Meridian.of({"index_excess": volume}, symmetry)
+        ring = meridian.quantities["index_excess"][5, (meridian.r > 5) & (meridian.r < 9)]
+        assert np.isnan(ring).all() == missing
+        assert np.isfinite(ring).all() != missing
+
+
 def of_numbers(axial: bool = True, **quantities: float) -> Meridian:
     """Quantities that are the same everywhere, but for what they grow along h."""
     r, h = np.linspace(0 if axial else -3, 3, 7), np.linspace(-2, 2, 5)

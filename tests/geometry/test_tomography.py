@@ -110,6 +110,12 @@ def equal(camera: Camera, expected: Camera) -> bool:
     return float(max(errors)) < 1e-9
 
 
+def test_rows_of_astra_have_twelve_numbers():
+    entries = {**astra_of(rig("perspective"), SIZE, GRID)}
+    with refused("Vectors"):
+        from_astra({**entries, "Vectors": entries["Vectors"][:, :11]})
+
+
 @pytest.mark.parametrize(
     ("program", "kind"), [("astra", "perspective"), ("astra", "telecentric"), ("tigre", "perspective")]
 )

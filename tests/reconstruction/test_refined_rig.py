@@ -103,6 +103,23 @@ def test_the_shift_of_the_middle_is_linear_in_the_parameters(measured):
         assert row["image_shift_px"] == pytest.approx(expected, rel=0.02)
 
 
+def test_a_stretched_image_does_not_shift_at_its_middle(measured):
+    odd = measured.select([measured.names[0]])
+    height, width = odd.cameras[0].image_size
+    numbers = dict(zip(NAMES[-4:], (0.4, 0.1, -0.2, 0.3), strict=True))
+    row = {
+        "name": odd.names[0],
+        "values": numbers,
+        "prior_sigma": {},
+        "correction_over_sigma": 0.0,
+        "image_shift_px": 0.0,
+    }
+    change = (with_corrections(odd, [row]).displacement - odd.displacement)[0].nan_to_num()
+    corners = change[0, 0] + change[height - 1, width - 1]
+    assert float(corners.abs().max()) < 1e-5
+    assert float(change[0, 0].abs().max()) > 0.1
+
+
 @pytest.mark.parametrize("case", ["noise above the signal", pytest.param("column", marks=pytest.mark.slow)])
 def test_unconstrained_poses_are_reported(measured, case):
     if case == "column":  # with open faces, since its ends would constrain heights

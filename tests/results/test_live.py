@@ -52,6 +52,27 @@ def test_the_status_of_a_run(measurement, method, withhold, tmp_path, monkeypatc
     assert np.mean((look.predicted - look.measured)[valid] ** 2) < 2 * np.mean(look.measured[valid] ** 2)
 
 
+def test_a_long_curve_has_even_steps(measurement, tmp_path):
+    status = Live(tmp_path, measurement, METHODS[0])
+    with status.watching(QUIET, withheld=False, snapshots=False).training("t") as on_step:
+        for number in range(1, 5 * live.CURVE_POINTS):
+            on_step(
+                Step(
+                    number,
+                    0.0,
+                    float(number),
+                    0.5,
+                    {"loss": 1.0},
+                    0.0,
+                    dict,
+                    lambda: make_phantom("flame", measurement.box),
+                )
+            )
+    steps = np.array(read_live(tmp_path)["curve"]["step"])
+    assert live.CURVE_POINTS / 3 < len(steps) <= live.CURVE_POINTS
+    assert set(np.diff(steps)) <= {7, 8}
+
+
 def test_the_view_is_seen_by_the_camera_that_is_refined(measurement, tmp_path, monkeypatch):
     monkeypatch.setattr(live, "FIELD_DELAY", 0.0)
     shifts = torch.zeros(4, len(GEOMETRY), dtype=torch.float64)
