@@ -62,7 +62,7 @@ ITERATIONS, CONVERGED = 30, 0.03
 TRIAL_ITERATIONS = 6
 """Iterations of a trial: the coarse grid predicts no better with more, which fit what it cannot represent."""
 DRAW_ITERATIONS, DRAWS = 12, 3  # DRAWS: for the size of the error of a prediction
-SIGNIFICANT, EARLY = 1.1, 3.0  # sigma: residual above which there is detail; in a short run, which has not converged
+SIGNIFICANT, EARLY = 1.1, 3.0  # sigma: residual above which there is detail; in cross-validation, not yet converged
 EXPLAINED = 0.7  # of the signal of the field's own detail
 BETTER = 0.99  # of the error of a prediction, at most
 TRIALS = 4  # blurred or not, in one pass or two
