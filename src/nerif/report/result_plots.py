@@ -166,7 +166,7 @@ def draw_line(
 ) -> tuple[Axes, Axes]:
     """Draw measurement (NaN where invalid) and prediction along a line of pixels, and the residual below.
 
-    Error bars are one sigma; `label` ends with the unit in brackets.
+    Bars are one sigma; `label` ends with the unit in brackets.
     """
     above, below = axes
     at, blue, orange = np.arange(len(measured)), COLOURS["blue"], COLOURS["orange"]

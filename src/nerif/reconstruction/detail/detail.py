@@ -119,7 +119,7 @@ class Posterior:
         return self._splines(self._error(seed, on_iteration))
 
     def error_of(self, target: Target) -> float:
-        """Return the rms error of the prediction of other views over sigma that draws predict."""
+        """Return the rms residual of other views over sigma that draws predict."""
         squares = [self.detail.prediction_square(target, self._error(seed), measured=False) for seed in range(DRAWS)]
         return math.sqrt(sum(squares) / DRAWS)
 
