@@ -2,7 +2,7 @@
 
 Whole runs of the pipeline, from measurement to result directory, with views of 100² px: NeRIF with `--detail off` and
 `auto`, 60 s each and on the rough flows 150 s too, and `gp` and `tv`, which end by themselves. Residuals are those of
-the re-projected training views over sigma, rms.
+the re-projected fitted views over sigma, rms.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@ Is it right?
 ============
 
 Real data have no truth to compare with. Four questions decide whether a reconstruction can be used: do the views
-agree with each other, is a withheld view predicted, what is the verdict, and how large are the error bars?
+agree with each other, is a withheld view predicted, what is the verdict, and how large are the standard deviations?
 """
 
 # %%
@@ -44,8 +44,8 @@ print(nerif.check_consistency(measurement).findings or "corrected: No problems f
 # %%
 # Is a withheld view predicted?
 # -----------------------------
-# ``reconstruct_into`` is ``nerif reconstruct``: it withholds one view in a first run, predicts it, then fits all, and
-# writes a directory with the report. ``uncertainty="fast"`` adds standard deviations.
+# ``reconstruct_into`` is ``nerif reconstruct``: a cross-validation run withholds one view and predicts it, the
+# main run fits all. It writes a directory with the report. ``uncertainty="fast"`` adds standard deviations.
 folder = Path(tempfile.mkdtemp())
 method = nerif.preset("fast", max_steps=300)
 run = nerif.RunSettings(uncertainty="fast", report=False)
@@ -53,21 +53,21 @@ nerif.reconstruct_into(folder / "result", measurement, method, run, voxels=48)
 result = nerif.ResultDirectory(folder / "result").read()
 for view in result.metrics.cross_validation["views"]:
     print(
-        f"withheld view {view['name']}: CC {view['cc']:.4f}, error {view['rms']:.4f} px"
+        f"withheld view {view['name']}: CC {view['cc']:.4f}, residual {view['rms']:.4f} px"
     )
 
 # %%
 # The verdict
 # -----------
-# Cross-validation, residuals of every view and error bars in one sentence: *use*, *use with care*, *do not use* or
+# Cross-validation, residuals of every view and standard deviations in one sentence: *use*, *use with care*, *do not use* or
 # *cannot tell*.
 from nerif.analysis.verdict import verdict
 
 print(textwrap.fill(verdict(result).sentence, 80))
 
 # %%
-# Error bars
-# ----------
+# Standard deviations
+# -------------------
 # The standard deviation of the index at every voxel.
 deviation = result.volumes["index_excess_std"]
 figure = deviation.plot()

@@ -101,7 +101,7 @@ def test_misfit_and_noise_count_as_error():
 
 
 def test_the_misfit_of_a_first_run_scatters_as_that_of_its_one_view():
-    """Six times the pixels would scatter by the root of six less; the misfit of the whole run is at the noise."""
+    """Six times the pixels would scatter by the root of six less; the misfit of the main run is at the noise."""
     first = first_run(0.07, 0.03)
     six_times = {**first, "fitted_views": [noisy("b", 0.03, pixels=6000)]}
     errors = [judged(views=views_of(0.02), cross_validation=run).error for run in (first, six_times)]
@@ -234,7 +234,7 @@ def with_axis(views: list[dict[str, Any]] = VIEWS, **more: Any) -> dict[str, Any
 @pytest.mark.parametrize(
     ("settings", "metrics", "rating", "words"),
     [
-        # a first run that was too short, or does not predict its view, gives no estimate
+        # a cross-validation run that was too short, or does not predict its view, gives no estimate
         ({}, {"views": views_of(0.02), "cross_validation": first_run(0.98, 0.97)}, "cannot tell", "too short"),
         ({}, {"views": views_of(0.6), "cross_validation": first_run(0.6, 0.6)}, "do not use", "estimated by"),
         ({}, {"views": views_of(0.02), "cross_validation": first_run(0.64, 0.6)}, "cannot tell",
@@ -310,14 +310,14 @@ def test_two_estimates_are_averaged_where_they_agree():
 @pytest.mark.parametrize(
     ("metrics", "sentence"),
     [
-        ({"views": VIEWS, "cross_validation": FIRST}, "estimated by predicting view a, left out of a short first run;"),
-        ({"views": [*VIEWS, view("g", 0.09, True)]}, "estimated by predicting view g, left out of the run;"),
-        ({"views": [*VIEWS, view("g", 0.09, True), view("h", 0.09, True)]}, "predicting 2 views, left out of the run;"),
+        ({"views": VIEWS, "cross_validation": FIRST}, "predicting view a, withheld from the cross-validation run;"),
+        ({"views": [*VIEWS, view("g", 0.09, True)]}, "estimated by predicting view g, withheld from the run;"),
+        ({"views": [*VIEWS, view("g", 0.09, True), view("h", 0.09, True)]}, "2 views, withheld from the run;"),
     ],
 )
 def test_the_error_is_stated_with_what_it_is_of_and_estimated_from(metrics, sentence):
     values = judged(**metrics).sentence
-    assert re.match(r"Use: the field is wrong by about [\d.]+ % of its difference from the ambient \(rms, ", values)
+    assert re.match(r"Use: the field is wrong by about [\d.]+ % of its variation about the ambient \(rms, ", values)
     assert sentence in values
 
 

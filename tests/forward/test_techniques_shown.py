@@ -85,7 +85,7 @@ def test_the_report_of_two_techniques_shows_both(both):
         assert expected in words, expected
     metrics = json.loads((both / "metrics.json").read_text())
     first, *_, last = (" ".join(line.split(":")[0].split()[1:]) for line in score_lines(metrics["views"]))
-    assert (first, last) == ("training views, displacement", "withheld view, fringes")
+    assert (first, last) == ("fitted views, displacement", "withheld view, fringes")
 
 
 def test_views_have_a_row_for_each_component_and_colours_for_what_it_measures(absorption, both):
@@ -116,7 +116,7 @@ def test_figures_have_the_labels_and_units_of_the_technique(absorption, monkeypa
     assert "absorbance [1]" in labels["view_0deg"]
     assert not any("displacement" in text or "kg" in text for text in labels.values())
     monkeypatch.setattr(Absorption, "unit", "dB")
-    assert "difference [dB]" in [axes.get_ylabel() for axes in view(result.reprojection, 0, 190).axes]
+    assert "residual [dB]" in [axes.get_ylabel() for axes in view(result.reprojection, 0, 190).axes]
 
 
 def test_files_name_their_field(absorption, both, tmp_path, capsys):

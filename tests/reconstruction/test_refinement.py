@@ -281,8 +281,8 @@ def test_significant_corrections_are_reported():
     near |= {"values": {"shift_x": 0.1}, "prior_sigma": {"shift_x": 0.2}}
     far = {**near, "name": "b", "correction_over_sigma": 5.0, "values": {"shift_x": 1.0}}
     first, line = refinement_lines([near, far, near, near])
-    assert "b, 5.0 sigma" in first
-    assert line.startswith("view b is not where its calibration says: shift_x 1 mm, 5.0 sigma")
+    assert "b, 5.0 × the prior" in first
+    assert line.startswith("view b is not where its calibration says: shift_x 1 mm, 5.0 × the prior")
 
 
 @pytest.mark.slow

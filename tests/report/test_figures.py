@@ -91,7 +91,7 @@ def test_images_of_few_rows_are_drawn_as_lines(size, lines):
         assert not above.images
     assert panels[-1].get_xlabel() == ("row [px]" if size[0] > 3 else "column [px]")
     above, below = panels[:2]
-    assert (above.get_ylabel(), below.get_ylabel()) == ("u [px]", "difference [px]")
+    assert (above.get_ylabel(), below.get_ylabel()) == ("u [px]", "residual [px]")
     measured = above.containers[0].lines[0].get_ydata()
     assert np.isnan(measured[0])
     assert len(measured) == max(size)

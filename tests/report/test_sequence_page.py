@@ -51,7 +51,7 @@ def test_the_page_lists_what_is_available_and_what_is_not(tmp_path):
     words = re.sub(r"<[^>]+>", " ", page[: page.index("<script")])
     for phrase in (
         "3 of 5", "1 frame failed", "frame 1: no valid pixel", "1 of 5 frames are missing", "film.zarr",
-        "CC at least 0.99, rms error at most 0.01 px", "CC at least 0.9, rms error at most 0.04 px",
+        "CC at least 0.99, rms residual at most 0.01 px", "CC at least 0.9, rms residual at most 0.04 px",
     ):  # fmt: skip
         assert phrase in words, phrase
     assert "Measured and re-projected" not in words

@@ -56,8 +56,9 @@ def test_a_view_is_predicted_before_it_is_used(measurement, complete, tmp_path, 
     assert not any(v["withheld"] for v in views.values())
     assert views[name]["rms"] < score["rms"]
     figures = dict(accuracy_rows(result))
-    assert {f"View {name}, withheld from the first run", f"View {name}, after the whole run"} <= set(figures)
-    assert any("Cross-validation: a short run" in s.text for s in statements(result))
+    assert f"View {name}, withheld from the cross-validation run" in figures
+    assert f"View {name}, fitted by the main run" in figures
+    assert any("The cross-validation run, without view" in s.text for s in statements(result))
     assert result.settings["withhold"] == ["auto"]
 
 

@@ -167,7 +167,7 @@ def test_corners_beyond_the_distortion_are_left_out_and_reported(measurement, tm
     counting = nullcontext(lambda done, total: counts.append((done, total)))
     reconstruct_into(tmp_path / "r", whole, QUICK, RUN, monitor=Monitor(lines.append, counting=lambda title: counting))
     assert sum(line.startswith(f"view '{camera.name}': {distorted.unseen:.1%} of the pixels") for line in lines) == 1
-    assert any("4 training views" in line for line in lines)
+    assert any("4 fitted views" in line for line in lines)
     assert counts == [(i, 5) for i in range(1, 6)]
     most = replace(camera, distortion=16 * folding)
     with refused("distortion of view '0deg'"):

@@ -195,15 +195,15 @@ def _rms(values: Tensor) -> float:
 
 
 def rms_with_unit(view: ViewScores, digits: int = 4) -> str:
-    """Return the rms error of a view with its unit."""
+    """Return the rms residual of a view with its unit."""
     return with_unit(number(view.get("rms"), digits), view["unit"])
 
 
 def score_lines(views: list[ViewScores]) -> list[str]:
-    """Return a line with the worst scores of the training views and one of the withheld views, for each technique."""
+    """Return a line with the worst scores of the fitted views and one of the withheld views, for each technique."""
     lines = []
     measured = dict.fromkeys(v["measured"] for v in views)
-    for (role, withheld), name in itertools.product((("training", False), ("withheld", True)), measured):
+    for (role, withheld), name in itertools.product((("fitted", False), ("withheld", True)), measured):
         group = [v for v in views if v["withheld"] is withheld and v["measured"] == name]
         if group:
             cc = min(v["cc"] for v in group)
@@ -211,7 +211,7 @@ def score_lines(views: list[ViewScores]) -> list[str]:
             noise = max(v.get("rms_over_sigma", float("nan")) for v in group)
             in_sigma = "" if noise != noise else f", at most {noise:.2f} sigma"
             head = f"{len(group)} {role} view{'s' * (len(group) > 1)}{f', {name}' if len(measured) > 1 else ''}"
-            lines.append(f"{head}: CC at least {cc:.4f}, rms error at most {rms}{in_sigma}")
+            lines.append(f"{head}: CC at least {cc:.4f}, rms residual at most {rms}{in_sigma}")
     return lines
 
 

@@ -71,7 +71,7 @@ SYMMETRY = Remedy(
     ("axis", "planar"),
 )
 CHECK = Remedy("nerif check finds swapped u and v, wrong signs, and mirrored or exchanged images")
-WITHHOLD = Remedy("--withhold auto withholds one in a first run", "withhold", ("auto",))
+WITHHOLD = Remedy("--withhold auto withholds one in a cross-validation run", "withhold", ("auto",))
 DEVIATIONS = Remedy("--uncertainty fast computes standard deviations", "uncertainty", ("fast", "full"))
 LONGER = {
     "time_limit": "a longer --time-limit", "steps": "more --max-steps", "epochs": "more --epochs",

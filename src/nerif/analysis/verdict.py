@@ -7,11 +7,12 @@ Estimated relative error of the variation of the field:
 with rms values relative to the signal,
 
     s    noise, of N pixels in all
-    f    residual of the training views beyond the noise: unresolved detail, or views that contradict each other
+    f    residual of the fitted views beyond the noise: unresolved detail, or views that contradict each other
     e    residual of a withheld view beyond the noise: what the other views leave undetermined
 
-In cross-validation, e_1 and f_1 are those of a short first run without one view. The run with all views reduces the
-untrained part of e_1 in proportion to the misfit, and the undetermined part, all that exceeds K f_1, by the factor G:
+In cross-validation, e_1 and f_1 are those of the short cross-validation run without one view. The main run, with all
+views, reduces the untrained part of e_1 in proportion to the misfit, and the undetermined part, all that exceeds K f_1,
+by the factor G:
 
     e = max(f / f_1 e_1, G (e_1^2 - K^2 f_1^2)^(1/2))
 
@@ -41,14 +42,14 @@ __all__ = ["RATINGS", "Estimate", "Verdict", "correlated_share", "cut_off", "tim
 
 RATINGS = ("use", "use with care", "do not use", "cannot tell")
 
-A_WITHHELD, A_FIRST_RUN = 0.25, 0.4  # A, for a view withheld from the whole run and from a first one
+A_WITHHELD, A_FIRST_RUN = 0.25, 0.4  # A, for a view withheld from the whole run, and from the cross-validation run only
 B_MISFIT, C_NOISE, N0_PIXELS = 0.8, 0.2, 8000
 K_UNTRAINED, G_UNDETERMINED = 3.5, 0.4
 MIN_MISFIT_RATIO = 0.07  # smallest f / f_1
 VIEWS_FACTOR, DEVIATIONS_FACTOR = 2.0, 1.5  # up and down, the range that holds in nine of ten cases
 
 MIN_EXPLAINED = 0.5  # of the squared signal; a field that explains less is no reconstruction of these data
-MIN_PREDICTED = 0.7  # of the squared signal of a view withheld from a first run, for an estimate of little error
+MIN_PREDICTED = 0.7  # of the squared signal of the view withheld from cross-validation, for an estimate of little error
 MAX_USE, MAX_CARE = 0.035, 0.12  # error of the variation
 DOUBTFUL, SEVERE = (1.7, 0.005), (2.2, 0.02)  # grain of a residual, and its correlated part over the signal
 OUTLIER = 1.5  # times the correlated part of the median view
@@ -118,7 +119,7 @@ class Verdict:
         if self.error is None:
             return f"{head}{self.reasons}."
         span = "" if self.low is None or self.high is None else f", {_percent(self.low)} to {_percent(self.high)}"
-        error = f"the field is wrong by about {_percent(self.error)} of its difference from the ambient (rms{span})"
+        error = f"the field is wrong by about {_percent(self.error)} of its variation about the ambient (rms{span})"
         return f"{head}{error}, {self.reasons}."
 
 
@@ -133,7 +134,7 @@ def verdict(result: Result) -> Verdict:
     cameras = len({camera_of(v["name"]) for v in fitted})  # a view has an entry for each technique, or each half
     remedy = advice([SYMMETRY], result.settings) if cameras == 1 else CHECK.words
     cut = cut_off(fitted)
-    for group, role in ((fitted, "training"), (withheld, "withheld")):
+    for group, role in ((fitted, "fitted"), (withheld, "withheld")):
         share = _explained(group, _noise(fitted))
         if share is not None and share < MIN_EXPLAINED:
             text = f"the field explains {max(share, 0.0):.0%} of the squared signal of the {role} views (noise removed)"
@@ -193,15 +194,15 @@ def cut_off(fitted: Sequence[View]) -> str:
 
 
 def _poor_first_run(result: Result) -> str:
-    """Why cross-validation gives no estimate: a view that the first run explains too little of; empty if none."""
+    """Why cross-validation gives no estimate: a view that its run explains too little of; empty if none."""
     first = result.metrics.cross_validation
     views = _fitted_quantities(first["views"] if first else [], result)
     share = _explained(views, _noise(_fitted_quantities(first["fitted_views"] if first else [], result)))
     if share is None or share >= MIN_PREDICTED:
         return ""
     more = f"; {longer(result)} makes it longer" if longer(result) else ""
-    text = f"the first run explains {share:.0%} of the squared signal of its withheld view {views[0]['name']}"
-    return f"{text}: too little for an estimate{more}"
+    text = f"the cross-validation run explains {share:.0%} of the squared signal of its withheld view"
+    return f"{text} {views[0]['name']}: too little for an estimate{more}"
 
 
 def _percent(share: float) -> str:
@@ -230,7 +231,7 @@ def _noise(fitted: Sequence[View]) -> dict[str, float]:
     """The rms noise of a view for each measured quantity.
 
     The pixel-to-pixel noise of the residuals or, where larger (correlated noise), the stated sigma, but at most the
-    residual of the training views.
+    residual of the fitted views.
     """
     noise = {}
     for name in dict.fromkeys(v["measured"] for v in fitted):
@@ -271,8 +272,8 @@ def _from_views(
     )
     noise = _noise(fitted)
     for views, basis in (
-        (withheld, "left out of the run"),
-        (first_views, "left out of a short first run"),
+        (withheld, "withheld from the run"),
+        (first_views, "withheld from the cross-validation run"),
     ):
         usable = [v for v in views if v["measured"] in noise and v["measured"] in _quantities(views)]
         if not usable:
@@ -281,7 +282,7 @@ def _from_views(
         if views is first_views:
             share = _explained(first_fitted, noise)
             if share is not None and share < MIN_EXPLAINED:
-                run = f"the first run, without view {usable[0]['name']}, was too short for cross-validation"
+                run = f"the cross-validation run, without view {usable[0]['name']}, was too short"
                 more = f"; {longer(result)} makes it longer" if longer(result) else ""
                 return None, f"{run}: it explains {share:.0%} of its data{more}"
             largest, factor = _after_first_run(largest, fitted, first_fitted, noise), A_FIRST_RUN
@@ -306,7 +307,7 @@ def _withheld(view: View, noise: dict[str, float]) -> float:
 def _after_first_run(
     error: float, fitted: Sequence[View], first_fitted: Sequence[View], noise: dict[str, float]
 ) -> float:  # fmt: skip
-    """e after the whole run from e_1 (error); e_1 itself where the misfit of the first run is unknown."""
+    """e after the main run from e_1 (error); e_1 itself where the misfit of the cross-validation run is unknown."""
     if not first_fitted:
         return error
     (after, *_), (before, white, pixels) = _misfit(fitted, noise), _misfit(first_fitted, noise)

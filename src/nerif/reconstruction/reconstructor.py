@@ -35,8 +35,8 @@ __all__ = [
 VOXELS = 100  # of a volume along the longest edge
 NOTEBOOK_VOXELS = 48  # along the longest edge
 MISFITS = {  # columns of a history, the most informative first
-    "residual_over_sigma": "times the noise, rms over the training views",
-    "residual": "rms over the training views, relative to the ambient field",
+    "residual_over_sigma": "times the noise, rms over the fitted views",
+    "residual": "rms over the fitted views, relative to the ambient field",
     "loss": "loss, relative to the ambient field",
 }
 
@@ -238,4 +238,4 @@ class Reconstructor(ABC):
 
     @abstractmethod
     def split_for_cross_validation(self) -> tuple[Reconstructor, Reconstructor]:
-        """Return settings of a short first run, and of a run that starts from its field within the same limits."""
+        """Return settings of the cross-validation run, and of a main run that starts from it, within the limits."""

@@ -130,7 +130,8 @@ def refinement_lines(table: Sequence[RefinedView]) -> list[str]:
     """Return a summary of a refinement, and a line for each view with a significant correction."""
     most = max(table, key=lambda row: row["correction_over_sigma"])
     size = most["correction_over_sigma"]
-    lines = [f"refined {len(table)} views; largest correction: {most['name']}, {size:.1f} sigma"]
+    largest = f"{most['name']}, {size:.1f} × the prior standard deviation"
+    lines = [f"refined {len(table)} views; largest correction: {largest}"]
     if size < ROUNDING:
         lines = [f"refined {len(table)} views: pose errors are not significant; cameras unchanged"]
     if len(table) <= FEW_VIEWS:
@@ -146,7 +147,7 @@ def refinement_lines(table: Sequence[RefinedView]) -> list[str]:
         number, value = max(row["values"].items(), key=lambda n: abs(n[1]) / max(row["prior_sigma"][n[0]], 1e-30))
         lines.append(
             f"view {row['name']} is not where its calibration says: {number} {value:.3g} {UNITS[NAMES.index(number)]}, "
-            f"{row['correction_over_sigma']:.1f} sigma, {row['image_shift_px']:.2g} px in the image; calibrate it "
-            "again, or state a larger pose_sigma"
+            f"{row['correction_over_sigma']:.1f} × the prior standard deviation, {row['image_shift_px']:.2g} px in the "
+            "image; calibrate it again, or state a larger pose_sigma"
         )
     return lines

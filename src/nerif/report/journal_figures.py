@@ -154,7 +154,7 @@ def view(reprojection: Reprojection, i: int, width: float) -> Figure:
 
 
 def _maps(maps: list[Maps], width: float) -> Figure:
-    """Measured, re-projected and difference of every component."""
+    """Measured, re-projected and residual of every component."""
     rows = sum(len(o.components) for o, *_ in maps)
     height_px, width_px, _ = maps[0][1].shape
     figure = _page(width, min(1.2, 0.31 * rows * height_px / width_px + 0.08))
@@ -166,18 +166,18 @@ def _maps(maps: list[Maps], width: float) -> Figure:
             draw_map(row[0], measured[..., c], limits)
             draw_map(row[1], predicted[..., c], limits)
             draw_map(row[2], (predicted - measured)[..., c], difference_limits)
-            for axes, title in zip(row, ("measured", "re-projected", "difference"), strict=True):
+            for axes, title in zip(row, ("measured", "re-projected", "residual"), strict=True):
                 axes.set_title(f"{title} {component}" if len(o.components) > 1 else title)
                 axes.label_outer()
             label = f"{component} [{o.technique.unit}]"
             add_colour_bar(list(row if o.signed else row[:2]), label)
             if not o.signed:
-                add_colour_bar([row[2]], f"difference [{o.technique.unit}]")
+                add_colour_bar([row[2]], f"residual [{o.technique.unit}]")
     return figure
 
 
 def _lines(maps: list[Maps], width: float) -> Figure:
-    """Every component along every row, or along every column if these are fewer: values and difference."""
+    """Every component along every row, or along every column if these are fewer: values and residual."""
     upright = maps[0][1].shape[0] > maps[0][1].shape[1]
     along, across = ("row", "column") if upright else ("column", "row")
     count = min(maps[0][1].shape[:2])

@@ -143,7 +143,7 @@ def draw_slice_scores(axes: Axes, slices: Sequence[Any]) -> Axes:
 
 
 def draw_view_scores(axes: Axes, views: list[ViewScores]) -> Axes:
-    """Draw the rms error of every view, over the noise if that is known for all; withheld views are hatched."""
+    """Draw the rms residual of every view, over the noise if that is known for all; withheld views are hatched."""
     in_sigma = all(np.isfinite(v.get("rms_over_sigma", np.nan)) for v in views)
     several = len({v["measured"] for v in views}) > 1
     names = []
@@ -157,16 +157,16 @@ def draw_view_scores(axes: Axes, views: list[ViewScores]) -> Axes:
     if in_sigma:
         axes.axhline(1, color=COLOURS["grey"], linewidth=0.8, linestyle="--")
     axes.set_xticks(range(len(views)), names, rotation=90)
-    axes.set_ylabel("rms error / noise [1]" if in_sigma else f"rms error [{plain(views[0]['unit'])}]")
+    axes.set_ylabel("rms residual / σ [1]" if in_sigma else f"rms residual [{plain(views[0]['unit'])}]")
     return axes
 
 
 def draw_line(
     axes: tuple[Axes, Axes], measured: np.ndarray, predicted: np.ndarray, sigma: np.ndarray | None, label: str
 ) -> tuple[Axes, Axes]:
-    """Draw measurement (NaN where invalid) and prediction along a line of pixels, and their difference below.
+    """Draw measurement (NaN where invalid) and prediction along a line of pixels, and the residual below.
 
-    Error bars are one standard deviation; `label` ends with the unit in brackets.
+    Bars are one sigma; `label` ends with the unit in brackets.
     """
     above, below = axes
     at, blue, orange = np.arange(len(measured)), COLOURS["blue"], COLOURS["orange"]
@@ -176,7 +176,7 @@ def draw_line(
     below.axhline(0, color=COLOURS["grey"], linewidth=0.6)
     below.errorbar(at, predicted - measured, sigma, **points)
     above.set_ylabel(label)
-    below.set_ylabel(f"difference [{label.rpartition('[')[2]}")
+    below.set_ylabel(f"residual [{label.rpartition('[')[2]}")
     above.legend(frameon=False)
     return axes
 

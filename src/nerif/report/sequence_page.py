@@ -99,12 +99,12 @@ def _fit_rows(store: VolumeSequence, frames: list[int]) -> list[tuple[str, str]]
         return [("Truth", "volumes as stored")]
     withheld = np.array([v in store.attributes.get("withhold", ()) for v in store.attributes["views"]])
     rows = []
-    groups = (("Training views", ~withheld), ("Withheld views", withheld))
+    groups = (("Fitted views", ~withheld), ("Withheld views", withheld))
     for (name, group), of in itertools.product(groups, scores):
         cc, rms = (np.asarray(array[:])[frames][:, group] for array in (of.cc, of.rms))
         if np.isfinite(rms).any():
             least, most = number(float(np.nanmin(cc)), 4), number(float(np.nanmax(rms)), 3)
-            text = f"CC at least {least}, rms error at most {with_unit(most, of.technique.unit)}"
+            text = f"CC at least {least}, rms residual at most {with_unit(most, of.technique.unit)}"
             rows.append((name + _suffix(of, scores), text))
     seconds = np.asarray(store.array("seconds")[:])[frames]
     return [*rows, ("Time per frame", f"{number(float(np.median(seconds)), 3)} s (median)")]
@@ -125,7 +125,7 @@ def _curves(store: VolumeSequence, frames: list[int]) -> list[tuple[str, str]]:
             if np.isfinite(rms[:, i]).any():
                 style, label = ("--", f"{name} (withheld)") if name in withheld else ("-", name)
                 axes.plot(times, rms[:, i], lw=1.2, ls=style, label=plain(label))
-        axes.set(xlabel="time [ms]", ylabel=f"rms difference from the measurement [{of.technique.unit}]")
+        axes.set(xlabel="time [ms]", ylabel=f"rms residual [{of.technique.unit}]")
         axes.set_ylim(bottom=0)
         axes.legend(fontsize=7, ncols=2)
 

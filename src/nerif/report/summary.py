@@ -92,10 +92,10 @@ def _ambient_temperature(result: Result) -> float | None:
 
 
 def accuracy_rows(result: Result) -> Rows:
-    """Return names and values of the accuracy: withheld and training views, outcome, truth, standard deviations."""
+    """Return names and values of the accuracy: withheld and fitted views, outcome, truth, standard deviations."""
     metrics, rows = result.metrics, []
-    withheld, training, first_run = _views(result, True), _views(result, False), cross_validated(result)
-    for title, views in (("Withheld view", withheld), ("Training views", training)):
+    withheld, fitted, first_run = _views(result, True), _views(result, False), cross_validated(result)
+    for title, views in (("Withheld view", withheld), ("Fitted views", fitted)):
         quantities = dict.fromkeys(v["measured"] for v in views)
         for measured in quantities:
             group = [v for v in views if v["measured"] == measured]
@@ -103,12 +103,12 @@ def accuracy_rows(result: Result) -> Rows:
             name = f"{title}{plural}{f', {measured}' if len(quantities) > 1 else ''}"
             rows.append((name, _scores(group)))
         if not views and not (views is withheld and first_run):
-            rows.append((title, "none" if training else "unknown"))
+            rows.append((title, "none" if fitted else "unknown"))
     for view in first_run:
         place = _place(view, first_run)
-        rows.append((f"View {place}, withheld from the first run", _scores([view])))
-        same = [v for v in training if (v["name"], v["measured"]) == (view["name"], view["measured"])]
-        rows += [(f"View {place}, after the whole run", _scores([v])) for v in same]
+        rows.append((f"View {place}, withheld from the cross-validation run", _scores([view])))
+        same = [v for v in fitted if (v["name"], v["measured"]) == (view["name"], view["measured"])]
+        rows += [(f"View {place}, fitted by the main run", _scores([v])) for v in same]
     rows += [(f"{view['name']}, camera refined", _scores([view])) for view in metrics.withheld_views]
     rig = [row for row in metrics.rig if "rms_after" in row]
     if rig:
@@ -137,7 +137,7 @@ def accuracy_rows(result: Result) -> Rows:
         rows.append(("Detail", f"{mean}, {detail['voxels']} voxels; {residuals}"))
     if coverage := metrics.coverage:
         text = f"{coverage['two_sigma']:.0%} of the voxels, {coverage['two_sigma_in_flow']:.0%} of those in the flow"
-        rows.append(("Truth within ±2 σ", text))
+        rows.append(("Truth within ±2 standard deviations", text))
     return rows
 
 
@@ -146,7 +146,7 @@ def _scores(views: list[View]) -> str:
     cc, noise = _extreme(views, "cc", min), _extreme(views, "rms_over_sigma")
     rms = rms_with_unit(max(views, key=lambda v: v["rms"]), 3)
     least, most = ("at least ", "at most ") if len(views) > 1 else ("", "")
-    return f"CC {least}{number(cc, 5)}, rms error {most}{rms}{'' if noise is None else f' = {noise:.2f} σ'}"
+    return f"CC {least}{number(cc, 5)}, rms residual {most}{rms}{'' if noise is None else f' = {noise:.2f} σ'}"
 
 
 def _extreme(views: Sequence[Any], key: str, extreme: Callable[..., float | None] = max) -> float | None:
@@ -164,7 +164,7 @@ def _views(result: Result, withheld: bool) -> list[View]:
 
 
 def cross_validated(result: Result) -> list[View]:
-    """Return the scores of the view that was withheld from the first run of a cross-validation."""
+    """Return the scores of the view that was withheld from the run of a cross-validation."""
     first_run = result.metrics.cross_validation
     return list(first_run["views"]) if first_run else []
 
@@ -219,9 +219,9 @@ def _of_withheld_views(result: Result) -> list[Statement]:
     worst = min(views, key=lambda v: v["cc"])
     cc, noise, name = worst["cc"], _extreme(views, "rms_over_sigma"), _place(worst, views)
     among = f" (worst of {len(views)})" if len(views) > 1 else ""
-    if not withheld:  # a short run, from which the verdict extrapolates
-        text = f"Cross-validation: a short run without view {name}{among} predicts it with CC {cc:.4f}; "
-        return [Statement("good" if cc >= MIN_CC else "note", text + "the whole run uses all views.")]
+    if not withheld:  # a run from which the verdict extrapolates
+        text = f"The cross-validation run, without view {name}{among}, predicts it with CC {cc:.4f}; "
+        return [Statement("good" if cc >= MIN_CC else "note", text + "the main run uses all views.")]
     if cc >= MIN_CC:
         beyond = "" if noise is None or noise <= 2 else f", but its residual is {noise:.1f} × the noise"
         text = f"The withheld view {name}{among} is predicted with CC {cc:.4f}{beyond}."
@@ -233,14 +233,14 @@ def _of_withheld_views(result: Result) -> list[Statement]:
 
 
 def _of_residuals(result: Result) -> list[Statement]:
-    training = _views(result, False)
-    if not training:
-        text = "No training view was compared, so it is unknown whether the residuals are noise. "
+    fitted = _views(result, False)
+    if not fitted:
+        text = "No fitted view was compared, so it is unknown whether the residuals are noise. "
         text += "nerif evaluate --measurement FILE compares the views of the reconstruction."
         return [Statement("note", text)] if _views(result, True) else []
-    views = [v for v in training if math.isfinite(v.get("rms_over_sigma", math.nan))]
+    views = [v for v in fitted if math.isfinite(v.get("rms_over_sigma", math.nan))]
     if not views:
-        of_images = any(k.background for k in TECHNIQUES.values() if k.measured == training[0]["measured"])
+        of_images = any(k.background for k in TECHNIQUES.values() if k.measured == fitted[0]["measured"])
         remedy = "nerif displacement writes sigma." if of_images else "Give its sigma."
         text = "The noise of the measurement is unknown, so it is unknown whether the residuals are noise."
         return [Statement("note", f"{text} {remedy}")]
@@ -250,17 +250,15 @@ def _of_residuals(result: Result) -> list[Statement]:
     if high > NOISE_RANGE[1]:
         white = bool((highest.get("residual_test") or {"white": False})["white"])
         level = "warning" if high <= 3 or white else "bad"  # a white residual may be noise with a wrong sigma
-        text = f"Training view {_place(highest, views)}: residual {high:.1f} times the noise: "
+        text = f"Fitted view {_place(highest, views)}: residual {high:.1f} times the noise: "
         faces = "" if result.settings.get("open_faces") else "flow that leaves the box (--open-faces), "
         causes = f"possible causes: {faces}the calibration (run nerif check), a sigma that is too small."
-        text += f"first run longer ({longer(result)}); if it stays, run nerif check." if longer(result) else causes
+        text += f"run longer first ({longer(result)}); if it stays, run nerif check." if longer(result) else causes
         remarks.append(Statement(level, text))
     if low < NOISE_RANGE[0]:
-        text = f"The residual of training view {_place(lowest, views)} is {low:.2f} times the noise: "
+        text = f"The residual of fitted view {_place(lowest, views)} is {low:.2f} times the noise: "
         remarks.append(Statement("warning", text + "the field fits noise, or sigma is too large."))
-    return remarks or [
-        Statement("good", f"The residuals of the training views are {low:.2f} to {high:.2f} × the noise.")
-    ]
+    return remarks or [Statement("good", f"The residuals of the fitted views are {low:.2f} to {high:.2f} × the noise.")]
 
 
 def _of_correlated_residuals(result: Result) -> list[Statement]:
@@ -274,8 +272,8 @@ def _of_correlated_residuals(result: Result) -> list[Statement]:
         )
         worst, share = group[0], correlated_share(group[0])
         names = ", ".join(_place(v, views) for v in group[:MAX_NAMES]) + (", ..." if len(group) > MAX_NAMES else "")
-        verb = f"Residuals of {len(group)} training views ({names}) are"
-        verb = verb if len(group) > 1 else f"The residual of training view {names} is"
+        verb = f"Residuals of {len(group)} fitted views ({names}) are"
+        verb = verb if len(group) > 1 else f"The residual of fitted view {names} is"
         where = f"row {worst['residual_test']['row']:.0f}, column {worst['residual_test']['column']:.0f}"
         size = f"up to {percent(share)} of the signal"
         text = f"{verb} spatially correlated, {size} in {_place(worst, views)} around {where}."

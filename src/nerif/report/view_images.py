@@ -1,4 +1,4 @@
-"""Measurement, prediction and difference of every view as small images for a page."""
+"""Measurement, prediction and residual of every view as small images for a page."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class ColourScale:
     measured: str  #: the quantity
     unit: str  #: "" if dimensionless
     limits: tuple[float, float]  #: ends of the colours of measurement and prediction
-    difference_limits: tuple[float, float]  #: ends of the colours of the difference
+    difference_limits: tuple[float, float]  #: ends of the colours of the residual
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class PageView:
     withheld: bool  #: whether the reconstruction did not use it
     scores: list[ViewScores]  #: cc, ssim, rms, rms_over_sigma of each technique
     rows: dict[str, tuple[str, str, str]]
-    """By component, such as u and v: addresses of measurement, prediction, difference."""
+    """By component, such as u and v: addresses of measurement, prediction, residual."""
     size: tuple[int, int]  #: height and width of the view, px
     bin_size: tuple[int, int]  #: pixels (rows, columns) of the view per pixel of the images
 
@@ -64,7 +64,7 @@ def lattice_step(measurement: Measurement, max_pixels: int) -> int:
 def view_images(reprojection: Reprojection, metrics: list[ViewScores]) -> tuple[list[PageView], list[ColourScale]]:
     """Return the images of all views, and the colours of each technique.
 
-    The colour range is the 99.8th percentile of the measurement, the 99.5th of the difference, over all views.
+    The colour range is the 99.8th percentile of the measurement, the 99.5th of the residual, over all views.
     """
     m = reprojection.measurement
     rows: list[dict[str, tuple[str, str, str]]] = [{} for _ in m.cameras]

@@ -74,7 +74,7 @@ class Result:
     metrics: Metrics = field(default_factory=Metrics)  #: of metrics.json; all empty if missing
     history: list[dict[str, float]] = field(default_factory=list)  #: records of history.csv, blanks as NaN
     volumes: dict[str, Volume] = field(default_factory=dict)
-    """By quantity; with error bars also index_excess_std, density_std, ..."""
+    """By quantity; with standard deviations also index_excess_std, density_std, ..."""
     reprojection: Reprojection | None = None  #: measured and predicted views, or None
     measurement: Measurement | None = None  #: or None
     truth: Volume | None = None  #: field it was compared with, an index relative to the ambient of the result, or None

@@ -70,7 +70,7 @@ class PredictionAccuracy(TypedDict):
 
 
 class WithheldRun(TypedDict):
-    """Cross-validation: the first run, without one view."""
+    """The cross-validation run, without one view."""
 
     views: list[ViewScores]  #: scores of the withheld view
     fitted_views: list[ViewScores]  #: scores of one of the others

@@ -1,4 +1,4 @@
-"""Cross-validation: a short run without one view gives its prediction error; the run with all views starts from it."""
+"""Cross-validation: a short run without one view gives its prediction error; the main run starts from its field."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ SCORES = "views.json"
 
 
 def withheld_views(withhold: Sequence[str], names: Sequence[str]) -> tuple[str, ...]:
-    """Return the names of the views that the whole run withholds; `names`: of all views."""
+    """Return the names of the views that the main run withholds; `names`: of all views."""
     words = tuple(withhold)
     return () if words in (AUTO, NONE) and words[0] not in names else words
 
@@ -61,7 +61,7 @@ def with_halves(
 
 @dataclass(frozen=True)
 class ShortFit:
-    """The field of the short run, and its data with the cameras that it refined."""
+    """The field of the cross-validation run, and its data with the cameras that it refined."""
 
     field: Field  #: reconstructed
     training: Measurement  #: data of the views that it used
@@ -70,11 +70,11 @@ class ShortFit:
 
 @dataclass(frozen=True)
 class CrossValidation:
-    """The short run without a view, in the result directory."""
+    """The cross-validation run, without a view, in the result directory."""
 
     out: ResultDirectory  #: the result directory
-    reconstructor: Reconstructor  #: settings of the whole run
-    data: Measurement  #: of the whole run
+    reconstructor: Reconstructor  #: settings of the main run
+    data: Measurement  #: of the main run
     checkpoint_every: float = 60.0  #: s
     monitor: Monitor = QUIET  #: of the progress
     restart: bool = False  #: whether to ignore the content of the directory
@@ -118,7 +118,8 @@ class CrossValidation:
         with self._directory.writing(SCORES) as path:
             write_json(path, entries)
         for v in views:
-            say(f"cross-validation: withheld view {name} predicted with CC {v['cc']:.4f}, rms error {rms_with_unit(v)}")
+            scores_of = f"CC {v['cc']:.4f}, rms residual {rms_with_unit(v)}"
+            say(f"cross-validation: withheld view {name} predicted with {scores_of}")
         return result
 
     def scores(self) -> WithheldRun | None:
@@ -128,7 +129,7 @@ class CrossValidation:
 
     @property
     def fit(self) -> ShortFit | None:
-        """The field of the short run with its data; None if there is none."""
+        """The field of the cross-validation run with its data; None if there is none."""
         if not self._directory.has(FIELD):
             return None
         result = self._run.read()

@@ -24,7 +24,7 @@ class RunSettings(MediumSettings):
 
     withhold: tuple[str, ...] = AUTO
     """Withheld views for cross-validation: names; left or right (half of each image of an axisymmetric flow); auto (one
-    view, in a short run from which the run with all views starts); or none."""
+    view, in a short cross-validation run from which the main run, with all views, starts); or none."""
     start_from: Path | None = None
     """Result directory with the initial field: a reconstruction by any method in the same box."""
     extend_open_faces: NonNegative = 0.0

@@ -45,12 +45,12 @@ from nerif.workflow.reports import write_report
 
 __all__ = ["STEPS", "fit", "judge", "write_page"]
 
-EXPLAINED = 0.6  # of the signal by the first run, above which a blurred field may take most of the time
+EXPLAINED = 0.6  # of the signal by the cross-validation run, above which a blurred field may take most of the time
 MOST_DETAIL, MOST_BLURRED = 0.35, 0.7  # of the time that is left; where the field is blurred, its training matters less
 
 
 def cross_validate(run: ReconstructionRun, so_far: StepOutputs) -> StepOutputs:
-    """Predict a view from a short run without it; the main run starts from the field of that run.
+    """Predict a view from the cross-validation run, without it; the main run starts from the field of that run.
 
     Writes and resumes from cross_validation/. If it is interrupted, its field is the result.
     """
@@ -97,7 +97,7 @@ def _detail(run: ReconstructionRun, left: float) -> DetailChoice | None:
         choice = choose(coarse, withheld, math.inf if on else MOST_BLURRED * left, bar)
     if not math.isnan(choice.before):
         errors = f"{choice.before:.2f} sigma without it, {choice.after:.2f} with it"
-        say(f"detail: residual of the withheld view, on pixels by which nothing was chosen, {errors}")
+        say(f"detail: residual of the withheld view, on pixels without part in this choice, {errors}")
     if choice.seconds > detail_share(run, choice) * left and not on:
         say(f"detail left out: it takes about {choice.seconds:.0f} s; give a longer --time-limit")
         return None
@@ -121,7 +121,7 @@ def coarse_detail(run: ReconstructionRun) -> tuple[Detail, Measurement] | None:
 def detail_share(run: ReconstructionRun, choice: DetailChoice) -> float:
     """Return the largest share of the time left that detail may take.
 
-    A first run that explains little of its data does not show what a longer one would leave: training comes first.
+    If the cross-validation explains little of its data, it does not show what a longer run would leave: training first.
     """
     scores = run.validation.scores() if run.validation is not None else None
     views = [v for v in scores["fitted_views"] if "rms_measured" in v] if scores else []

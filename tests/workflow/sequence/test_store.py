@@ -259,5 +259,5 @@ def test_views_are_scored_by_every_technique(tmp_path):
     assert store.array("rms_fringes")[0, 2] > 35
     assert re.search(r"displacement \S+ px and fringes \S+$", outcome_table(store))
     text = text_of(store)
-    for title in ("Training views, displacement", "Training views, fringes", "Every view over time, fringes"):
+    for title in ("Fitted views, displacement", "Fitted views, fringes", "Every view over time, fringes"):
         assert title in text

@@ -189,8 +189,8 @@ ABOUT = "Fields, verdicts, comparison, export."
 HINT = Hint(
     "Shows the field with its verdict, compares results, and exports them.",
     "Move the sliders of the slices. Then open the tabs In 3-D, Report and Export.",
-    "The verdict states whether the field can be used, and why. This short run asks for care: a longer one with a "
-    "withheld view also estimates the error.",
+    "The verdict states whether the field can be used, and why. This result of few steps is to be used with care: a "
+    "longer run with a withheld view also estimates the error.",
     before="reconstruct",
 )
 PAGE = Page("results", "Results", ABOUT, build, HINT)

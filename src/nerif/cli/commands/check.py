@@ -128,7 +128,7 @@ def _rig(settings: Check, measurement: Measurement) -> RigCheck:
 
     sigma = (settings.pose_sigma_mm, settings.pose_sigma_deg)
     result = check_rig(measurement, settings.refine, settings.time_limit, *sigma, MONITOR, settings.aperture)
-    heads = ("change [sigma]", "shift [px]", "+- [px]", "less uncertain", "residual [sigma]")
+    heads = ("change / prior", "shift [px]", "+- [px]", "less uncertain", "residual [sigma]")
     say(f"{'view':<14}" + "".join(f"{head:>18}" for head in heads))
     for row in result.table:
         residual = f"{row['rms_before']:.2f} -> {row['rms_after']:.2f}" if "rms_after" in row else "unknown"

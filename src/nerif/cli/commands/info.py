@@ -154,7 +154,7 @@ def _result(path: Path) -> None:
         if value is not None and not isinstance(value, list | dict):
             say(f"  {name:<18} {value}")
     for v in metrics.views:
-        use = "withheld" if v["withheld"] else "training"
+        use = "withheld" if v["withheld"] else "fitted"
         say(f"  view {v['name']:<14} {use}  CC {number(v['cc'], 5)}  rms {v['measured']} error {rms_with_unit(v)}")
 
 

@@ -62,7 +62,7 @@ ITERATIONS, CONVERGED = 30, 0.03
 TRIAL_ITERATIONS = 6
 """Iterations of a trial: the coarse grid predicts no better with more, which fit what it cannot represent."""
 DRAW_ITERATIONS, DRAWS = 12, 3  # DRAWS: for the size of the error of a prediction
-SIGNIFICANT, EARLY = 1.1, 3.0  # sigma: residual above which there is detail; in a short run, which has not converged
+SIGNIFICANT, EARLY = 1.1, 3.0  # sigma: residual above which there is detail; in cross-validation, not yet converged
 EXPLAINED = 0.7  # of the signal of the field's own detail
 BETTER = 0.99  # of the error of a prediction, at most
 TRIALS = 4  # blurred or not, in one pass or two
@@ -119,7 +119,7 @@ class Posterior:
         return self._splines(self._error(seed, on_iteration))
 
     def error_of(self, target: Target) -> float:
-        """Return the rms error of the prediction of other views over sigma that draws predict."""
+        """Return the rms residual of other views over sigma that draws predict."""
         squares = [self.detail.prediction_square(target, self._error(seed), measured=False) for seed in range(DRAWS)]
         return math.sqrt(sum(squares) / DRAWS)
 
