@@ -58,10 +58,11 @@ export SOURCE_DATE_EPOCH ?= $(shell git log -1 --format=%ct 2>/dev/null || date 
 DIST ?= dist
 
 dist: .venv/.dist
-	rm -rf $(DIST) build/lib build/bdist.*
+	rm -rf $(DIST) build/sdist
 	PIP_CONSTRAINT=constraints.txt $(BIN)/python -m build --sdist --outdir $(DIST)
 	$(BIN)/python tools/reproducible_sdist.py $(DIST)/*.tar.gz
-	umask 022; $(BIN)/python -m pip wheel $(PIP) -c constraints.txt --no-deps --wheel-dir $(DIST) $(DIST)/*.tar.gz
+	umask 022; mkdir -p build/sdist; tar -xzf $(DIST)/*.tar.gz --strip-components 1 -C build/sdist; \
+	  PIP_CONSTRAINT=constraints.txt $(BIN)/python -m build --wheel --outdir $(DIST) build/sdist
 	$(BIN)/python -m twine check --strict $(DIST)/*
 	$(BIN)/check-wheel-contents $(DIST)/*.whl
 	ls -l $(DIST)

@@ -1,6 +1,7 @@
-"""The README as PyPI shows the text alone. Links and images of files are replaced by their addresses in the repository, at the tag of
-the version. Without an address (`[tool.publication]` in pyproject.toml) images are left out and links become plain
-text.
+"""The README as PyPI shows it; all else is in pyproject.toml.
+
+PyPI has the text alone. Links and images of files are replaced by their addresses in the repository, at the tag of the
+version. Without an address (`[tool.publication]` in pyproject.toml) images are left out and links become plain text.
 """
 
 import re
