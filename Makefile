@@ -82,6 +82,7 @@ sbom: .venv/.sbom
 	$(PYTHON) -m venv build/sbom
 	build/sbom/bin/python -m pip install $(PIP) -c constraints.txt $(TORCH)
 	build/sbom/bin/python -m pip install $(PIP) -c constraints.txt $(DIST)/*.whl
+	rm build/sbom/lib/*/site-packages/nerif_bost-*/direct_url.json  # the folder of this build
 	$(BIN)/cyclonedx-py environment --output-reproducible --output-file build/sbom.json build/sbom/bin/python
 
 publication:
