@@ -8,6 +8,9 @@ sys.path[:0] = [str(HERE), str(HERE / "_extensions")]
 
 from nerif import __version__  # noqa: E402
 
+sys.path.append(str(HERE.parent / "tools"))
+from publication import Addresses  # noqa: E402
+
 project = "nerif"
 author = "The nerif developers"
 copyright = "the nerif developers; MIT licence"
@@ -24,13 +27,16 @@ extensions = [
     "figures",
     "repository",
 ]
-exclude_patterns = ["_build", "_drawings", "_extensions", "tutorials"]
+exclude_patterns = ["_build", "_drawings", "_extensions", "_templates", "tutorials"]
 language = "en_GB"
 smartquotes = False  # -- is an option of the command line
 suppress_warnings = [
     "misc.highlighting_failure",  # TOML with "..." where a matrix stands
     "ref.python",  # two classes of one name, in annotations that are not evaluated
 ]
+
+ADDRESSES = Addresses.read()
+INSTALL = f": %pip install git+{ADDRESSES.repository}" if ADDRESSES.repository else ""
 
 sphinx_gallery_conf = {  # the notebooks: scripts that run when the site is built
     "examples_dirs": "tutorials",
@@ -40,6 +46,7 @@ sphinx_gallery_conf = {  # the notebooks: scripts that run when the site is buil
     "abort_on_example_error": True,
     "download_all_examples": False,
     "show_signature": False,
+    "first_notebook_cell": f"# nerif has to be installed where this runs{INSTALL}",
     "write_computation_times": False,  # a page with scripts from the web
 }
 
@@ -62,7 +69,20 @@ toc_object_entries_show_parents = "hide"
 
 html_theme = "furo"
 html_title = f"nerif {version}"
+html_baseurl = f"{ADDRESSES.site}/latest/" if ADDRESSES.site else ""  # the canonical address of a page
 html_static_path = ["_static"]
+templates_path = ["_templates"]
+html_sidebars = {  # the theme's, with the other versions
+    "**": [
+        "sidebar/scroll-start.html",
+        "sidebar/brand.html",
+        "versions.html",
+        "sidebar/search.html",
+        "sidebar/navigation.html",
+        "sidebar/scroll-end.html",
+    ]
+}
+html_js_files = ["versions.js"]
 html_css_files = ["nerif.css"]
 html_copy_source = False
 html_show_sourcelink = False
