@@ -47,15 +47,21 @@ def flame(box: Box, voxels: int) -> VoxelField:
     return VoxelField.through(make_phantom("flame", box, 0).sample(grid), grid)
 
 
-def measure(
-    folder: Path, pixels: int, noise: float, options: str, device: str, flame_voxels: int, truth_voxels: int
-) -> dict[str, Any]:  # fmt: skip
+def simulated(folder: Path, pixels: int, noise: float, flame_voxels: int, truth_voxels: int) -> tuple[Path, Path]:
+    """Return the files of measurement and truth, simulated once."""
     path, truth = (folder / f"full-size-{pixels}-{flame_voxels}-{noise:g}{end}" for end in (".nc", ".truth.nc"))
     if not truth.is_file():
         cameras, box = paper_rig(pixels)
         field, grid = flame(box, flame_voxels), Grid.of_resolution(box, truth_voxels)
         add_noise(predict(field, cameras, box, N_AMBIENT), noise, seed=1).write(path)
         Volume.of(field.sample(grid), grid, "index_excess", N_AMBIENT).write(truth)
+    return path, truth
+
+
+def measure(
+    folder: Path, pixels: int, noise: float, options: str, device: str, flame_voxels: int, truth_voxels: int
+) -> dict[str, Any]:  # fmt: skip
+    path, truth = simulated(folder, pixels, noise, flame_voxels, truth_voxels)
     out, start = folder / f"full-size-{pixels}", time.perf_counter()
     _nerif("reconstruct", path, "--out", out, "--force", "--device", device, *options.split())
     seconds = time.perf_counter() - start

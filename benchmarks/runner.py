@@ -1,7 +1,8 @@
 """Run benchmarks: each case in a process of its own, one record per case. A benchmark is a module of this package with
 
     a docstring                        title and full stop; then what is measured
-    cases(quick)                       settings of every case: flat dicts of plain values
+    cases(quick)                       settings of every case: flat dicts of plain values; the process of one with a
+                                       "budget" (s) ends then
     measure(folder, **settings)        metrics of a case; `folder` holds simulated data that other cases of the run read
     COLUMNS                            heading: format string over settings and metrics, such as "{l2:.2%}"
 
@@ -50,7 +51,7 @@ N_AMBIENT = 1.00027
 NAMES = (
     "study", "methods", "one_camera", "absorption", "displacement", "calibration", "rigs", "images", "trust",
     "sequence", "voxel_cost", "full_size", "verdicts", "goals", "frame_offsets", "detail",
-    "bodies", "velocity", "paper_preset", "vectors", "media", "windows",
+    "bodies", "velocity", "paper_preset", "vectors", "media", "windows", "gpu",
 )  # fmt: skip
 PAGE_SECONDS = 180.0  # between two versions of a page during a run
 PRELOADED = [
@@ -348,6 +349,8 @@ def alone(name: str, case: Settings, data: Path) -> Record:
     process.start()
     sender.close()
     try:
+        if not receiver.poll(case.get("budget")):
+            return {"failed": f"stopped after its budget of {case['budget']:g} s"}
         record: Record = receiver.recv()
         process.join(10)
     except EOFError:

@@ -9,6 +9,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 import types
 
 import pytest
@@ -137,10 +138,24 @@ def killed(*arguments):
     os.kill(os.getpid(), signal.SIGKILL)
 
 
+def asleep(*arguments):
+    time.sleep(60)
+
+
 @pytest.mark.slow
 def test_a_process_that_is_killed_is_a_failure(monkeypatch, tmp_path):
     monkeypatch.setattr(runner, "_work", killed)
     assert "was killed" in runner.alone("study", {}, tmp_path)["failed"]
+
+
+@pytest.mark.slow
+def test_a_process_ends_with_its_budget(monkeypatch, tmp_path):
+    monkeypatch.setattr(runner, "_work", asleep)
+    assert "budget of 0.5 s" in runner.alone("study", {"budget": 0.5}, tmp_path)["failed"]
+
+
+def test_the_parts_for_a_card_take_twelve_minutes_at_most():
+    assert sum(case["budget"] for case in runner.benchmark("gpu").cases(quick=False)) <= 720
 
 
 @pytest.mark.slow

@@ -6,6 +6,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import suppress
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -14,6 +15,7 @@ from nerif.analysis.consistency import check_consistency
 from nerif.analysis.prediction import predict, reproject
 from nerif.analysis.rig_check import check_rig
 from nerif.common.pauses import at_pauses, pause
+from nerif.common.transfer import double_device
 from nerif.fields.network import Network
 from nerif.fields.network_shape import NetworkShape
 from nerif.fields.phantoms import make_phantom
@@ -28,6 +30,7 @@ from nerif.reconstruction.device import (
     free_threads,
     keep_freed_memory,
     peak_memory,
+    remark_on,
     resolve_device,
 )  # fmt: skip
 from nerif.reconstruction.neural import fused
@@ -39,22 +42,51 @@ from refusals import refused
 CPU, GPU = torch.device("cpu"), torch.device("cuda")
 
 
-def test_auto_is_a_gpu_if_there_is_one(monkeypatch):
-    for available, kind, settings in ((True, "cuda", "best"), (False, "cpu", "fast")):
-        monkeypatch.setattr(torch.cuda, "is_available", lambda available=available: available)
-        monkeypatch.setattr(torch.cuda, "device_count", lambda available=available: int(available))
-        assert resolve_device("auto").type == kind
-        assert preset("auto") == PRESETS[settings]
+@pytest.fixture
+def gpus(monkeypatch):
+    """Set the numbers of GPUs by type."""
+
+    def let(**counts: int) -> None:
+        for kind in ("cuda", "xpu", "mps"):
+            monkeypatch.setattr(getattr(torch, kind), "device_count", lambda kind=kind: counts.get(kind, 0))
+
+    return let
 
 
-def test_names_of_devices(monkeypatch):
-    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+@pytest.mark.parametrize(
+    ("counts", "kind", "settings"),
+    [({}, "cpu", "fast"), ({"cuda": 1, "xpu": 1}, "cuda", "best"), ({"xpu": 1, "mps": 1}, "xpu", "best"),
+     ({"mps": 1}, "cpu", "fast")],
+)  # fmt: skip
+def test_auto_is_a_gpu_that_is_likely_faster(gpus, counts, kind, settings):
+    gpus(**counts)
+    assert resolve_device("auto").type == kind
+    assert preset("auto") == PRESETS[settings]
+
+
+def test_names_of_devices(gpus, monkeypatch):
+    gpus(cuda=2, mps=1)
     assert resolve_device("cuda:1") == torch.device("cuda:1")
     monkeypatch.setenv("LOCAL_RANK", "1")
     assert resolve_device("cuda") == torch.device("cuda:1")  # under torchrun
-    for name in ("cuda:2", "tpu0", "meta"):
-        with refused("device"):
+    for name in ("cuda:2", "tpu0", "meta", "mps:1"):
+        with refused("device") as error:
             resolve_device(name)
+        assert all(word in str(error.value) for word in (f"'{name}'", "cpu, cuda:0, cuda:1, mps:0"))
+    with refused("device") as error:
+        resolve_device("xpu")
+    assert "XPU build" in str(error.value)
+
+
+def test_double_precision_is_on_the_cpu_where_a_gpu_has_none(gpus, monkeypatch):
+    gpus(cuda=1, xpu=2, mps=1)
+    has = {0: True, 1: False}
+    monkeypatch.setattr(torch.xpu, "get_device_properties", lambda device: SimpleNamespace(has_fp64=has[device.index]))
+    double_device.cache_clear()
+    for name, place in {"cuda:0": "cuda:0", "xpu:0": "xpu:0", "xpu:1": "cpu", "mps:0": "cpu", "cpu": "cpu"}.items():
+        assert resolve_device(name, torch.float64) == torch.device(place)
+        assert bool(remark_on(resolve_device(name))) is (place == "cpu" != name)
+    double_device.cache_clear()
 
 
 @pytest.mark.parametrize(
@@ -69,6 +101,8 @@ def test_precision_on_a_gpu(monkeypatch, precision, tf32, low):
     assert torch.get_float32_matmul_precision() == "highest"
     monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda including_emulation=True: including_emulation)
     assert autocast_dtype("auto", GPU) is None  # a GPU that emulates bf16
+    assert autocast_dtype("auto", torch.device("mps")) is None
+    assert autocast_dtype("bf16", torch.device("mps")) is torch.bfloat16
 
 
 def test_the_precision_of_products_is_restored():

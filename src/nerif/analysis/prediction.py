@@ -36,7 +36,7 @@ VOXEL_STEP = {"linear": 0.1, "cubic": 0.25}  # voxels between samples
 SAMPLES = 80  # per ray; error 0.06 % of the rms displacement for a network fitted to the flame
 SAMPLES_PER_VOXEL = 2  # the same for the splines of its detail
 GRADIENT_COST = 3.0  # of value and gradient, in evaluations: a forward pass and a backward pass of twice its work
-EXACT_WORK = {"cpu": 3e10, "cuda": 1e13}  # multiplications: a second on two cores
+EXACT_WORK = {"cpu": 3e10, "gpu": 1e13}  # multiplications: a second on two cores
 WALLS = 5  # times as many beside bodies, where splines would smooth the jump across a thin plate
 SPLINE_VOXELS, SPLINE_MARGIN = 100, 3  # along the longest edge of the box, at least, and beyond each face
 VALIDATION_VOXELS = 80  # of splines through the field of a short run
@@ -201,8 +201,9 @@ def _views_of(kind: type[ForwardModel], cameras: Sequence[Camera]) -> list[int]:
 
 def _is_exact(network: Network, points: float, device: torch.device | str) -> bool:
     """Whether the path integral through a network is computed on every pixel, at some points in all."""
-    most = EXACT_WORK[torch.device(device).type] * (WALLS if isinstance(network, WallNetwork) else 1)
-    return sum(p.numel() for p in network.parameters()) * points <= most
+    most = EXACT_WORK["cpu" if torch.device(device).type == "cpu" else "gpu"]
+    walls = WALLS if isinstance(network, WallNetwork) else 1
+    return sum(p.numel() for p in network.parameters()) * points <= most * walls
 
 
 def _samples(field: Field) -> int:

@@ -124,14 +124,12 @@ class Network(nn.Module):
     beside: ClassVar[int] = 0
     """Inputs of the first layer beside the encoding."""
     gains: Tensor
-    bounds: Tensor
     waves: Tensor
     octave: Tensor
 
     def __init__(self, shape: NetworkShape, bounds: tuple[float, float] = UNBOUNDED) -> None:
         super().__init__()
         self.shape, self.limits = shape, bounds
-        self.register_buffer("bounds", torch.tensor(bounds, dtype=torch.float64))
         e, w = encoded_width(shape.octaves, shape.directions) + self.beside, shape.width
         waves, octave = wave_vectors(shape.octaves, shape.directions)
         self.register_buffer("waves", waves, persistent=False)
@@ -180,10 +178,16 @@ class Network(nn.Module):
             gradient = gradient + (beside if slope is None else beside * slope[:, None])
         return value, gradient, self._gradient_heads(p, h) if heads else None
 
+    def _save_to_state_dict(self, destination: dict[str, Tensor], prefix: str, keep_vars: bool) -> None:
+        """Add the bounds, in double precision on the CPU."""
+        super()._save_to_state_dict(destination, prefix, keep_vars)
+        destination[f"{prefix}bounds"] = torch.tensor(self.limits, dtype=torch.float64)
+
     def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *others: Any) -> None:
         """Load weights; older files have no gains and weight octaves by octave_decay only, and have no bounds."""
         state_dict.setdefault(f"{prefix}gains", 2.0 ** (-self.shape.octave_decay * torch.arange(self.shape.octaves)))
-        low, high = state_dict.setdefault(f"{prefix}bounds", torch.tensor(UNBOUNDED, dtype=torch.float64)).tolist()
+        bounds = state_dict.pop(f"{prefix}bounds", None)
+        low, high = UNBOUNDED if bounds is None else bounds.tolist()
         self.limits = low, high
         super()._load_from_state_dict(state_dict, prefix, *others)
 

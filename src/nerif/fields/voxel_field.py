@@ -17,6 +17,7 @@ from torch import Tensor
 from nerif.common.arrays import Points, Values, Vectors
 from nerif.common.axis_order import order_remedy
 from nerif.common.conventions import InputError, parse_faces
+from nerif.common.transfer import in_double
 from nerif.fields.field import Field
 from nerif.geometry import Grid
 
@@ -57,12 +58,12 @@ class VoxelField(Field):
             remedy = order_remedy("volume", "zyx", grid.shape, values.shape)
             got = tuple(values.shape)
             raise InputError(f"expected the shape {grid.shape} (z, y, x), got {got}{remedy}", field="volume")
-        coefficients = values.to(torch.float64)
+        coefficients = in_double(values)
         for axis, n in enumerate(values.shape):
-            unit = torch.eye(n, dtype=torch.float64, device=values.device)
+            unit = torch.eye(n, dtype=torch.float64, device=coefficients.device)
             coefficients = _prefilter(coefficients, axis, unit[_mirrored(n, 1)])
-            coefficients = coefficients.index_select(axis, _mirrored(n, 2).to(values.device))
-        return cls(coefficients.to(values.dtype), grid, 3)
+            coefficients = coefficients.index_select(axis, _mirrored(n, 2).to(coefficients.device))
+        return cls(coefficients.to(values), grid, 3)
 
     def to(self, device: torch.device | str) -> VoxelField:
         """Return the field with its coefficients on a device."""
@@ -177,12 +178,12 @@ def spline_coefficients(
     """Return the coefficients within a boundary of the spline along axes with these values at the voxel centres."""
     if degree == 1:
         return values
-    coefficients = values.to(torch.float64)
+    coefficients = in_double(values)
     for axis in axes:
         n = values.shape[axis]
-        unit = torch.eye(n, dtype=torch.float64, device=values.device)[..., None].movedim(0, axis)
+        unit = torch.eye(n, dtype=torch.float64, device=coefficients.device)[..., None].movedim(0, axis)
         coefficients = _prefilter(coefficients, axis, boundary.extend(unit, 1, (axis,)).movedim(axis, 0)[..., 0])
-    return coefficients.to(values.dtype)
+    return coefficients.to(values)
 
 
 def _prefilter(values: Tensor, axis: int, extended: Float[Tensor, "m n"]) -> Tensor:

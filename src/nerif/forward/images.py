@@ -26,6 +26,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from nerif.common.conventions import InputError
+from nerif.common.transfer import in_double
 from nerif.fields.voxel_field import spline_weights
 from nerif.forward.deflection import LeverArm
 from nerif.forward.forward_model import ForwardModel, Light, Map, Mask, PerRay, Samples, Weights, masked_blur
@@ -129,9 +130,9 @@ class References:
             if int(used.sum()) > MAX_PIXELS:
                 random = torch.rand(len(used), generator=torch.Generator().manual_seed(i))
                 used &= (random < MAX_PIXELS / int(used.sum())).to(used.device)
-            p, w, y = terms[used].double(), inverse_sigma[used].double(), flow[used].double()
-            scale = reference[used].double().std().clamp(min=1e-9)
-            matrix = torch.cat([p * (reference[used].double() / scale)[:, None], p], dim=1)
+            p, w, y, image = (in_double(x[used]) for x in (terms, inverse_sigma, flow, reference))
+            scale = image.std().clamp(min=1e-9)
+            matrix = torch.cat([p * (image / scale)[:, None], p], dim=1)
             ridge = torch.full((matrix.shape[1],), RIDGE, dtype=torch.float64, device=p.device)
             ridge[0] = ridge[p.shape[1]] = 0
             less = torch.ones_like(w)
@@ -143,7 +144,7 @@ class References:
                 spread = 1.4826 * residual.median().clamp(min=1e-12)
                 less = (OUTLIER * spread / residual.clamp(min=1e-12)).clamp(max=1).sqrt()
             gain, offset = solution.float().split(p.shape[1])
-            self.brightness[i] = torch.stack([gain / scale.float(), offset])
+            self.brightness[i] = torch.stack([gain / scale.float(), offset]).to(self.brightness)
 
     def match(self, flow: Float[Tensor, "view row column"]) -> None:
         """Set constant gain and offset such that mean and standard deviation are those of the flow image."""

@@ -20,7 +20,7 @@ from nerif.geometry import Rays
 __all__ = ["LENS_RAYS", "FieldProjector", "PathIntegral", "places", "project"]
 
 LENS_RAYS = 16  # through the lens of a pixel, each with half as many samples as a thin ray
-CHUNK_RAYS = {"cpu": 32, "cuda": 4096}  # arrays that stay in the cache of a CPU, and fill a GPU
+CHUNK_RAYS = {"cpu": 32, "gpu": 4096}  # arrays that stay in the cache of a CPU, and fill a GPU
 
 
 class FieldProjector(ABC):
@@ -87,7 +87,7 @@ def project(
     projector: FieldProjector, field: Field, rays: Rays, device: torch.device | str = "cpu", chunk: int | None = None
 ) -> Float[Tensor, "n c"]:
     """Return the projections of a field along many rays, in chunks, on the device of the rays; 0 outside the box."""
-    chunk = chunk or CHUNK_RAYS["cpu" if torch.device(device).type == "cpu" else "cuda"]
+    chunk = chunk or CHUNK_RAYS["cpu" if torch.device(device).type == "cpu" else "gpu"]
     if rays.lens is not None:
         chunk = max(1, chunk * 2 // LENS_RAYS)
     result = rays.origin.new_zeros(len(rays), projector.channels)

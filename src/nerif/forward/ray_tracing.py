@@ -21,6 +21,7 @@ from torch import Tensor
 
 from nerif.common.conventions import InputError
 from nerif.common.pauses import pause
+from nerif.common.transfer import in_double
 from nerif.fields.field import Field
 from nerif.forward.path_integral import LENS_RAYS, FieldProjector
 from nerif.geometry import Rays
@@ -36,16 +37,14 @@ def trace(
     Positions and directions are in double precision, since a deflection is 1e-4 of a direction; the field is evaluated
     in the precision of `rays`. Outside the box the index is ambient, and its faces do not refract.
     """
-    single, double = rays.origin.dtype, torch.float64
-    step = ((rays.far - rays.near) / steps).to(double)[:, None] / n_ambient
+    step = in_double((rays.far - rays.near) / steps)[:, None] / n_ambient
 
     def d(position: Tensor) -> tuple[Tensor, Tensor]:
-        excess, gradient = field.value_and_gradient(position.to(single))
-        n = n_ambient + excess.to(double)[:, None]
-        return n, step * n * gradient.to(double)
+        excess, gradient = field.value_and_gradient(position.to(rays.origin))
+        n = n_ambient + in_double(excess)[:, None]
+        return n, step * n * in_double(gradient)
 
-    position = (rays.origin + rays.near[:, None] * rays.direction).to(double)
-    heading = rays.direction.to(double)
+    position, heading = in_double(rays.origin + rays.near[:, None] * rays.direction), in_double(rays.direction)
     for i in range(steps):
         pause()
         n, a = d(position)
@@ -65,11 +64,11 @@ def background_points(field: Field, rays: Rays, steps: int = 150, n_ambient: flo
     line of sight is invisible.
     """
     position, heading = trace(field, rays, steps, n_ambient)
-    origin, direction = rays.origin.to(position), rays.direction.to(position)
+    origin, direction, distance = (in_double(x) for x in (rays.origin, rays.direction, rays.ends.distance))
     path = ((position - origin) * direction).sum(-1)
     cosine = (heading * direction).sum(-1)
-    reach = (rays.ends.distance.to(position) - path) / cosine
-    return position + reach[:, None] * heading - (origin + rays.ends.distance.to(position)[:, None] * direction)
+    reach = (distance - path) / cosine
+    return position + reach[:, None] * heading - (origin + distance[:, None] * direction)
 
 
 @dataclass(frozen=True)
@@ -90,4 +89,4 @@ class CurvedRays(FieldProjector):
             spread = rays.spread(LENS_RAYS)
             return spread.mean_of(LENS_RAYS, self(field, spread))
         shift = background_points(field, rays, self.steps, self.n_ambient)
-        return torch.einsum("nij,nj->ni", rays.ends.sensitivity.to(shift), shift).to(rays.origin.dtype)
+        return torch.einsum("nij,nj->ni", in_double(rays.ends.sensitivity), shift).to(rays.origin)

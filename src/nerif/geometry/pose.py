@@ -40,7 +40,7 @@ class Corrections:
     @property
     def corrected(self) -> tuple[Camera, ...]:
         """The corrected cameras."""
-        return tuple(_corrected_camera(c, v) for c, v in zip(self.cameras, self.values.double().cpu(), strict=True))
+        return tuple(_corrected_camera(c, v) for c, v in zip(self.cameras, self.values.cpu().double(), strict=True))
 
     @cached_property
     def _views(self) -> dict[str, Tensor]:
@@ -55,7 +55,7 @@ class Corrections:
             "axis": rotation[:, 2],
             "centre": torch.stack([c.centre.double() for c in old]),
             "new_centre": torch.stack([c.centre.double() for c in new]),
-            "zoom": 1 + self.values[:, 6].double().cpu(),
+            "zoom": 1 + self.values[:, 6].cpu().double(),
             "depth": torch.tensor([c.projection.shows_depth for c in old]),
             "normal": torch.stack([nan if p is None else p.normal.double() for p in planes]),
             "offset": torch.tensor([torch.nan if p is None else p.offset for p in planes], dtype=torch.float64),
@@ -100,7 +100,7 @@ class Corrections:
             where = (views == v).nonzero()[:, 0]
             if not camera.interfaces or not len(where):
                 continue
-            traced = camera.rays(rays.pixel[where].double().cpu(), rays.background is not None)
+            traced = camera.rays(rays.pixel[where].cpu().double(), rays.background is not None)
             lens = None if rays.lens is None or traced.lens is None else replace(traced.lens, box=rays.lens.box)
             traced = replace(traced, view=rays.view[where], lens=lens)
             rays = rays.each(lambda old, new, i=where: old.index_copy(0, i, new.to(old)), traced)

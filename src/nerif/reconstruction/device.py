@@ -27,14 +27,28 @@ import torch
 from nerif.common.conventions import InputError
 from nerif.common.memory import free_memory
 from nerif.common.pauses import at_pauses
+from nerif.common.transfer import double_device
 
 __all__ = [
-    "Cores", "autocast_dtype", "available_memory", "float32_products", "free_threads", "keep_compiled_code_private",
-    "keep_freed_memory", "on_free_cores", "peak_memory", "resolve_device", "share_threads",
+    "FAST", "Cores", "autocast_dtype", "available_memory", "float32_products", "free_threads",
+    "keep_compiled_code_private", "keep_freed_memory", "on_free_cores", "peak_memory", "remark_on", "resolve_device",
+    "share_threads",
 ]  # fmt: skip
 
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
+
+FAST = ("cuda", "xpu")
+"""Types of device that multiply matrices faster in bfloat16, and for which PyTorch compiles networks.
+
+"auto" is the first of them that is there. ROCm's is "cuda". Apple's "mps" is used on request only: it has neither, no
+double precision, and no twin of the compiled step for CPUs, so it is not known to be faster.
+"""
+BUILDS = {
+    "cuda": "the CUDA or ROCm build of PyTorch",
+    "xpu": "the XPU build of PyTorch",
+    "mps": "macOS on an Apple GPU",
+}
 
 _here = threading.local()  # torch's number of threads is per calling thread, too
 
@@ -196,33 +210,41 @@ def _quota() -> int:
         return sys.maxsize
 
 
-def resolve_device(name: str) -> torch.device:
-    """Return the device of a name: "auto" is a GPU if there is one, "cuda" the first (under torchrun the process's)."""
+def resolve_device(name: str, dtype: torch.dtype = torch.float32) -> torch.device:
+    """Return the device of a name, or the CPU where it does not have the precision.
+
+    "auto" is a GPU of a type in FAST if there is one; "cuda" the first GPU, under torchrun that of the process.
+    """
+    counts = {kind: int(getattr(torch, kind).device_count()) for kind in BUILDS}
     if name == "auto":
-        name = "cuda" if torch.cuda.is_available() else "cpu"
+        name = next((kind for kind in FAST if counts[kind]), "cpu")
     try:
         device = torch.device(name)
     except RuntimeError:
         device = torch.device("meta")
-    if device.type not in ("cpu", "cuda"):
-        raise InputError(f"expected auto, cpu, cuda or cuda:N, got '{name}'", field="device")
-    if name == "cuda":
-        device = torch.device("cuda", int(os.environ.get("LOCAL_RANK", 0)))
-    if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
-        raise InputError(
-            f"expected one of {torch.cuda.device_count()} GPUs, got '{name}'; use --device cpu, "
-            "or install the CUDA build of torch",
-            field="device",
-        )
-    return device
+    if device.type in BUILDS and device.index is None:
+        device = torch.device(device.type, int(os.environ.get("LOCAL_RANK", 0)))
+    if device.type != "cpu" and (device.index or 0) >= counts.get(device.type, 0):
+        here = ", ".join(["auto", "cpu", *(f"{kind}:{i}" for kind, count in counts.items() for i in range(count))])
+        absent = device.type in BUILDS and not counts[device.type]
+        remedy = f"; {device.type} needs {BUILDS[device.type]}" if absent else ""
+        raise InputError(f"expected a device of this machine ({here}), got '{name}'{remedy}", field="device")
+    return double_device(device) if dtype == torch.float64 else device
+
+
+def remark_on(device: torch.device, dtype: torch.dtype = torch.float32) -> str:
+    """Return a remark on what runs on the CPU for lack of double precision, or nothing."""
+    if double_device(device) == device:
+        return ""
+    return f"; {device} has no double precision: {'all' if dtype == torch.float64 else 'what needs it'} ran on the CPU"
 
 
 def autocast_dtype(precision: str, device: torch.device) -> torch.dtype | None:
     """Return bfloat16 for precision "bf16", and for "auto" if the hardware supports it; else None."""
-    if device.type == "cuda":
-        fast = torch.cuda.is_bf16_supported(including_emulation=False)
+    if device.type in FAST:
+        fast = bool(torch.get_device_module(device).is_bf16_supported(including_emulation=False))
     else:
-        fast = bool(torch.cpu._is_avx512_bf16_supported())
+        fast = device.type == "cpu" and bool(torch.cpu._is_avx512_bf16_supported())
     return torch.bfloat16 if precision == "bf16" or (precision == "auto" and fast) else None
 
 
@@ -245,15 +267,15 @@ def float32_products(precision: Literal["highest", "high"]) -> Iterator[None]:
 
 def available_memory(device: torch.device) -> int:
     """Return the free memory in bytes of a GPU, or of the machine within the limit of a container or job."""
-    if device.type == "cuda":
-        return int(torch.cuda.mem_get_info(device)[0])
+    if device.type in FAST:
+        return int(torch.get_device_module(device).mem_get_info(device)[0])
     return free_memory()
 
 
 def peak_memory(device: torch.device) -> int:
-    """Return the highest memory in bytes: of tensors on a GPU, of the whole process on a CPU."""
-    if device.type == "cuda":
-        return int(torch.cuda.max_memory_allocated(device))
+    """Return the highest memory in bytes: of tensors on a GPU, of the whole process on a CPU and Apple's GPU."""
+    if device.type in FAST:
+        return int(torch.get_device_module(device).max_memory_allocated(device))
     try:
         import resource
     except ImportError:  # Windows

@@ -75,7 +75,7 @@ class Projector:
         measurement = apply_aperture(of_source(measurement, source, preferred="displacements"), aperture)
         measurement = replace(measurement, box=grid.box, ambient_region=None)
         self.measurement, self.grid, self.dtype = measurement, grid, dtype
-        self.device = resolve_device(str(device))
+        self.device = resolve_device(str(device), dtype)
         faces = faces_of(measurement) if ambient_faces is None else ambient_faces
         self.layout = InSpace(box=grid.box, faces=faces, basis=basis, device=self.device, dtype=dtype)
         target = Target.of(measurement, open_faces, model=model, linear=True, single=True)

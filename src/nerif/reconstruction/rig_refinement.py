@@ -260,7 +260,7 @@ class Refinement:
             other[:, i] += increments[:, i]
             there, _ = self.residual(part, other, predict, integral if i >= len(GEOMETRY) else None)
             slopes.append((there - now) / increments[:, i].to(now)[part.rays.view.long()][:, None])
-        return now.double().cpu(), torch.stack(slopes, dim=-1).double().cpu()
+        return now.cpu().double(), torch.stack(slopes, dim=-1).cpu().double()
 
     def residual(
         self, part: TechniqueData, values: Float[Tensor, "view 14"], predict: Predict, integral: Tensor | None = None

@@ -67,7 +67,7 @@ class SharedSettings(Reconstructor):
     open_faces: tuple[str, ...] = ()
     """Faces through which the flow leaves the box; rays that cross them are excluded."""
     device: str = "auto"
-    """Device: auto, cpu, cuda, cuda:1, ..."""
+    """Device: auto (cuda or xpu if present, else cpu), cpu, cuda (NVIDIA, AMD), cuda:1, xpu (Intel), mps (Apple)."""
 
     def __post_init__(self) -> None:
         check_settings(self)

@@ -21,7 +21,7 @@ from nerif.fields.network import Network, NeuralField
 from nerif.forward.forward_model import Weights
 from nerif.forward.path_integral import places
 from nerif.geometry import Rays
-from nerif.reconstruction.device import autocast_dtype, float32_products, keep_compiled_code_private
+from nerif.reconstruction.device import FAST, autocast_dtype, float32_products, keep_compiled_code_private
 from nerif.reconstruction.neural.training_settings import LossWeights
 from nerif.reconstruction.target import TechniqueData
 
@@ -53,7 +53,7 @@ class MixedPrecision:
     Parameters
     ----------
     precision : auto, float32, tf32 or bf16
-    compile : on, off, or auto: on CUDA by PyTorch, on a CPU in float32 by Numba (fused.py)
+    compile : on, off, or auto: on GPUs of FAST by PyTorch, on a CPU in float32 by Numba (fused.py)
     """
 
     def __init__(self, network: Network, device: torch.device, precision: str, compile: str) -> None:
@@ -64,7 +64,7 @@ class MixedPrecision:
         self.remark = ""
         """Why the network is not compiled."""
         self.evaluate: Evaluation = network.value_and_gradient
-        if network.compilable and (compile == "on" or (compile == "auto" and device.type == "cuda")):
+        if network.compilable and (compile == "on" or (compile == "auto" and device.type in FAST)):
             self.evaluate = self._compiled(network.value_and_gradient)
         elif compile == "on":
             self.remark = "; a network beside thin bodies is not compiled"

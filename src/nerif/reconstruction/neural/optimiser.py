@@ -37,6 +37,7 @@ from torch.optim.adam import adam
 from nerif.common.conventions import InputError
 from nerif.fields.network import Network
 from nerif.fields.network_shape import NetworkShape, encoded_width
+from nerif.reconstruction.device import FAST
 
 __all__ = ["OPTIMISERS", "NetworkOptimiser", "Optimiser", "adam_step"]
 
@@ -85,7 +86,7 @@ def muon_step(weight: Tensor, gradient: Tensor, memory: dict[str, Tensor], rate:
 def orthogonal(matrix: Float[Tensor, "m n"]) -> Float[Tensor, "m n"]:
     """Return approximately U V^T of the matrix U S V^T."""
     wide = matrix if matrix.shape[0] <= matrix.shape[1] else matrix.T
-    x = wide.bfloat16() if matrix.is_cuda else wide.float()
+    x = wide.bfloat16() if matrix.device.type in FAST else wide.float()
     x = x / x.norm().clamp_min(1e-7)
     for _ in range(ITERATIONS):
         gram = x @ x.T

@@ -16,6 +16,8 @@ from torch import Tensor, nn
 
 __all__ = ["Ranks"]
 
+BACKENDS = {"cuda": "nccl", "xpu": "xccl"}
+
 
 @dataclass(frozen=True)
 class Ranks:
@@ -40,11 +42,12 @@ class Ranks:
         return slice(self.rank, None, self.size)
 
     def join(self, device: torch.device) -> None:
-        """Connect to the other processes, by NCCL between GPUs and by gloo between CPUs."""
+        """Connect to the other processes, by the library of the GPUs, and by gloo between CPUs."""
         if self.size > 1 and not dist.is_initialized():
-            if device.type == "cuda":
-                torch.cuda.set_device(device)
-            dist.init_process_group("nccl" if device.type == "cuda" else "gloo")
+            backend = BACKENDS.get(device.type, "gloo")
+            if backend != "gloo":
+                torch.get_device_module(device).set_device(device)
+            dist.init_process_group(backend)
             atexit.register(dist.destroy_process_group)
 
     def average(self, values: Tensor, own_rays: int, rays: int) -> Tensor:
@@ -68,6 +71,6 @@ class Ranks:
         """Return the values of the first process."""
         if self.size == 1:
             return values
-        tensor = torch.tensor(values, dtype=torch.float64, device=device)
-        dist.broadcast(tensor, 0)
-        return tensor.tolist()
+        bits = torch.tensor(values, dtype=torch.float64).view(torch.int64).to(device)  # no GPU need have float64
+        dist.broadcast(bits, 0)
+        return bits.cpu().view(torch.float64).tolist()

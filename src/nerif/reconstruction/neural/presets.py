@@ -47,9 +47,9 @@ PRESETS: dict[str, NeRIF] = {
 def preset(name: str, **changes: Any) -> NeRIF:
     """Return the settings of a preset, with changes such as max_steps=500; "auto" is `best` with a GPU, else `fast`."""
     if name == "auto":
-        import torch
+        from nerif.reconstruction.device import resolve_device
 
-        name = "best" if torch.cuda.is_available() else "fast"
+        name = "fast" if resolve_device("auto").type == "cpu" else "best"
     if name not in PRESETS:
         raise InputError(f"expected auto, {', '.join(PRESETS)}, got '{name}'", field="preset")
     check_known(changes, [f.name for f in dataclasses.fields(NeRIF)], "preset")

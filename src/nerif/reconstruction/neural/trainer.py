@@ -17,7 +17,7 @@ from nerif.common.conventions import InputError
 from nerif.fields.field import Field
 from nerif.fields.network import UNBOUNDED
 from nerif.reconstruction.bounds import check_same_bounds
-from nerif.reconstruction.device import Cores, float32_products, peak_memory
+from nerif.reconstruction.device import Cores, float32_products, peak_memory, remark_on
 from nerif.reconstruction.field_files import check_fingerprint
 from nerif.reconstruction.neural.losses import MixedPrecision
 from nerif.reconstruction.neural.objective import Objective
@@ -142,7 +142,7 @@ class Trainer:
         assert outcome is not None
         self.watch.take_best()
         if not outcome.failed:
-            remark = self.watch.remark(outcome.reason == "converged") + self.network.remark
+            remark = self.watch.remark(outcome.reason == "converged") + self.network.remark + remark_on(self.device)
             outcome = Outcome(outcome.reason, outcome.message + remark)
         self.field.network.eval().requires_grad_(False)
         errors = self.objective.gauge_errors(LEVEL_POINTS, torch.Generator().manual_seed(0))

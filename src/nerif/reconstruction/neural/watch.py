@@ -97,7 +97,7 @@ class Watch:
         schedule = self.schedule
         schedule.outcome = self._end_cycle() or schedule.limit() or self._small_loss()
         due = schedule.done or self._due(schedule.step)
-        if self.data.device.type == "cuda" and not due:  # reading the loss would wait for the GPU
+        if self.data.device.type != "cpu" and not due:  # reading the loss would wait for the GPU
             return
         values, ambient = self._read(batch, loss, terms)
         if not math.isfinite(values["loss"]) or (schedule.done and not self._finite):

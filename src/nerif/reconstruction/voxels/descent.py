@@ -31,7 +31,7 @@ from nerif.geometry import Grid
 from nerif.reconstruction.aperture import apply_aperture
 from nerif.reconstruction.bins import pixel_subset
 from nerif.reconstruction.bounds import field_bounds
-from nerif.reconstruction.device import Cores, available_memory, peak_memory, resolve_device
+from nerif.reconstruction.device import Cores, available_memory, peak_memory, remark_on, resolve_device
 from nerif.reconstruction.field_files import check_fingerprint, fingerprint
 from nerif.reconstruction.gauge import Gauge, check_gauge, is_open, with_gauge
 from nerif.reconstruction.reconstructor import OnStep, Outcome, Reconstruction, State, Step
@@ -81,7 +81,7 @@ class VoxelRun:
         check_gauge(measurement, bool(settings.probes), settings.hull)
         self.axis = axis_of(settings, measurement)
         dtype = getattr(torch, settings.precision)
-        device = resolve_device(settings.device)
+        device = resolve_device(settings.device, dtype)
         self.layout = layout_of(measurement, self.axis, settings.basis, settings.step, device, dtype)
         self.device = self.layout.device
         self.cores = Cores(self.device)
@@ -367,9 +367,11 @@ class VoxelRun:
         state = self._capture()
         state.scalars["outcome"] = [outcome.reason, outcome.message]
         state.scalars["tolerance"] = self.settings.tolerance
+        remark = remark_on(resolve_device(self.settings.device), self.layout.dtype)
         return Reconstruction(
             field=self._field(self.here).to("cpu"), box=self.measurement.box, n_ambient=self.measurement.n_ambient,
-            history=self.history, outcome=outcome, settings=asdict(self.settings), seconds=self.seconds,
+            history=self.history, outcome=Outcome(outcome.reason, outcome.message + remark),
+            settings=asdict(self.settings), seconds=self.seconds,
             peak_memory_bytes=peak_memory(self.device), device=str(self.device), state=state,
             quantity=self.measurement.quantity, rig=self._table(), axis=self.axis, bodies=self.measurement.bodies,
         )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Sums over the planes that rays cross, and the adjoint, in PyTorch: for CUDA, and as the readable twin.
+"""Sums over the planes that rays cross, and the adjoint, in PyTorch: for GPUs, and as the readable twin.
 
 kernels_numba.py is the compiled twin for CPUs; planes.py defines a path.
 """
@@ -15,7 +15,7 @@ from nerif.fields.voxel_field import spline_weights
 
 __all__ = ["integrate", "spread"]
 
-SAMPLES_AT_A_TIME = {"cpu": 1 << 14, "cuda": 1 << 22}
+SAMPLES_AT_A_TIME = {"cpu": 1 << 14, "gpu": 1 << 22}
 """What stays in the cache of a CPU, and fills a GPU."""
 CHUNK_BYTES = 1 << 30  # of the arrays of a chunk on a GPU, about 60 numbers a sample
 
@@ -63,7 +63,7 @@ def spread(degree: int, sums: Float[Tensor, "n q"], path: Sequence[Tensor], shap
 
 def _chunks(path: Sequence[Tensor]) -> Iterator[list[Tensor]]:
     count = path[-1]
-    size = max(1, SAMPLES_AT_A_TIME.get(count.device.type, 1 << 14) // max(1, int(count.max())))
+    size = max(1, SAMPLES_AT_A_TIME["cpu" if count.device.type == "cpu" else "gpu"] // max(1, int(count.max())))
     for first in range(0, len(count), size):
         yield [a[first : first + size] for a in path]
 

@@ -34,8 +34,8 @@ class VoxelOperator:
         (A c)_r = sum_m w_rm [A_r f(x_rm) + B_r grad f(x_rm)],    f(x) = sum_ijk c_ijk b_ijk(x)
 
     Profile w, A and B are the model's (forward/forward_model.py); samples lie where rays cross evenly spaced planes.
-    `A(c)` applies the operator, `A.T(y)` its exact adjoint: on a CPU by Numba on all cores, on CUDA in PyTorch. A pixel
-    with a lens is the mean over thin rays, the more the wider its cone.
+    `A(c)` applies the operator, `A.T(y)` its exact adjoint: by Numba on all cores of a CPU, by PyTorch on a GPU. A
+    pixel with a lens is the mean over thin rays, the more the wider its cone.
 
     Parameters
     ----------

@@ -15,6 +15,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from nerif.common.conventions import InputError
+from nerif.common.transfer import double_device
 from nerif.fields.voxel_field import spline_weights
 from nerif.forward.forward_model import ForwardModel, Weights
 from nerif.geometry import Grid, Rays
@@ -111,6 +112,7 @@ class RayBundle:
     @classmethod
     def all_of(cls, rays: Rays, grid: Grid, degree: int, each: int, model: ForwardModel) -> list[RayBundle]:
         """Sort rays, clipped to the box, by the axis that they follow most closely."""
+        rays = rays.to(double_device(rays.near.device))
         crosses = rays.crosses.nonzero()[:, 0]
         spacing = torch.tensor(grid.spacing, dtype=torch.float64, device=rays.near.device)
         axis = (rays.direction[crosses].double() / spacing).abs().argmax(dim=1)

@@ -118,7 +118,7 @@ class VoxelSettings(SharedSettings):
         volumes, data = VOLUME_ARRAYS * math.prod(grid.shape) * self.itemsize, DATA_ARRAYS * numbers * self.itemsize
         per_pixel = lens_rays(measurement, grid)
         preparing = 40 * 8 * rays * per_pixel  # rays in double precision, while the operator is set up
-        overhead = kernels_torch.CHUNK_BYTES if device == "cuda" else COMPILER_BYTES
+        overhead = kernels_torch.CHUNK_BYTES if device != "cpu" else COMPILER_BYTES
         return self.operator_bytes(measurement, grid) + volumes + data + preparing + overhead
 
     def iteration_seconds(self, measurement: Measurement, grid: Grid, cores: int) -> float:
