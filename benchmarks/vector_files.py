@@ -131,18 +131,22 @@ def write_session(path: Path, grids: list[Grid], version: str = "5") -> None:
         raw.write(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(124, b" ") + b"\x00\x02IM")
 
 
-def pivlab_ascii(path: Path, grid: Grid) -> None:
-    """+export/file_save.m: y fastest, CRLF, NaN and vector type 0."""
-    x, y = (a + 1.5 for a in grid.xy)
+def pivlab_ascii(path: Path, grid: Grid, metres: bool = False) -> None:
+    """+export/file_save.m: y fastest, CRLF, NaN and vector type 0; in metres after a calibration with y up."""
+    (x, y), d = (a + 1.5 for a in grid.xy), grid.d
+    xy, uv, units = 1.0, 1.0, "x [px],y [px],u [px/frame],v [px/frame]"
+    if metres:
+        xy, uv, units = MM / 1e3, MM / 1e3 / DT, "x [m],y [m],u [m/s],v [m/s]"
+        x, y, d = xy * x, xy * (grid.height - y), uv * d * (1, -1)
     lines = [
         "PIVlab, ASCII chart output - 07-Oct-2026",
-        "FRAME: 1, filenames: A: a.tif & B: b.tif, conversion factor xy (px -> m): 1, "
-        "conversion factor uv (px/frame -> m/s): 1",
-        "x [px],y [px],u [px/frame],v [px/frame],Vector type [-]",
+        f"FRAME: 1, filenames: A: a.tif & B: b.tif, conversion factor xy (px -> m): {xy:.10g}, "
+        f"conversion factor uv (px/frame -> m/s): {uv:.10g}",
+        f"{units},Vector type [-]",
     ]
     for j in range(x.shape[1]):
         for i in range(x.shape[0]):
-            u, v = ("NaN", "NaN") if grid.missing[i, j] else (f"{grid.d[i, j, 0]:.10g}", f"{grid.d[i, j, 1]:.10g}")
+            u, v = ("NaN", "NaN") if grid.missing[i, j] else (f"{d[i, j, 0]:.10g}", f"{d[i, j, 1]:.10g}")
             lines.append(f"{x[i, j]:.10g},{y[i, j]:.10g},{u},{v},{0 if grid.missing[i, j] else 1}")
     path.write_bytes("\r\n".join([*lines, ""]).encode())
 
@@ -290,6 +294,7 @@ WRITERS = {
     "PIVlab session": Written(1.0, 1.0, lambda p, g: write_session(p, [g]), ".mat"),
     "PIVlab session 7.3": Written(1.0, 1.0, lambda p, g: write_session(p, [g], "7.3"), ".mat"),
     "PIVlab text": Written(1.0, 1.0, pivlab_ascii, ".txt"),
+    "PIVlab text in m/s": Written(1.0, 1.0, lambda p, g: pivlab_ascii(p, g, metres=True), ".txt"),
     "OpenPIV": Written(1.0, 0.5, openpiv, ".txt", digits=1e-3),
     "OpenPIV 2019": Written(1.0, 0.5, openpiv_old, ".txt", digits=1e-4),
     "DaVis .vc7": Written(0.5, 0.5, davis_buffer, ".vc7"),

@@ -115,7 +115,7 @@ def test_the_readme_on_pypi_has_no_relative_links(monkeypatch: pytest.MonkeyPatc
     if repository:
         assert f"]({repository}/raw/v1.2.3/docs/report.png)" in text
         assert f"]({repository}/tree/v1.2.3/docs/tutorials)" in text
-        assert f"]({repository}/blob/v1.2.3/docs/choosing.md#error-bars)" in text
+        assert f"]({repository}/blob/v1.2.3/docs/choosing.md#standard-deviations)" in text
     else:
         assert "![" not in text
         assert "github.com" not in text

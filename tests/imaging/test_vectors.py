@@ -194,6 +194,7 @@ def _rows(step: float = 8, names: str = "x,y,u,v", values: str = "0.1,0.2", firs
     [
         (_rows(names="x,y,u,q"), "expected columns x, y, u, v, got x, y, u, q without v"),
         (_rows(names="x [mm],y [mm],u [m/s],v [m/s]"), "without the length of a pixel; give --scale MM"),
+        (_rows(names="x [px],y [px],u [furlong],v [furlong]"), "got the unit 'furlong' of u; give --vector-unit"),
         (_rows(step=40), "expected vectors within the 168 x 200 px"),
         (_rows().replace("16,8", "19,8"), "at equal distances"),
         (_rows() + "\n8,8,0.1,0.2", "expected one vector at a position, got several"),
@@ -263,6 +264,21 @@ def test_file_that_openpiv_wrote() -> None:
     assert along == pytest.approx(-0.03, abs=0.002)
     assert -u0 / across == pytest.approx(100.25, abs=2.5)  # the noise is 0.1 px
     assert -v0 / along == pytest.approx(80.75 + 1 / 0.03, abs=2.5)
+
+
+def test_doubtful_scales_windows_and_calibrations_are_named(
+    rig: Rig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:  # fmt: skip
+    """Displacements beyond the window, vectors in a corner of the image, a window of a fraction of a pixel."""
+    for view in VIEWS:
+        _text(tmp_path, f"{view}.csv", _rows(step=2, names="x,y,u [m s-1],v [m s-1]"))
+    words = ("vectors", tmp_path, "--calibration", rig.calibration, "--out", tmp_path.parent / "d.nc", "--sigma", 0.1)
+    assert not run(*words, "--scale", 1.0, "--time-step", 1.0, "--window", 0.16)
+    text = capsys.readouterr().out
+    assert "u and v in m/s" in text
+    assert "displacements of 200 px exceed the window of 0.16 px; check --scale, --time-step" in text
+    assert "a window of 0.16 px with a vector on every 2 px" in text
+    assert "vectors cover 13% x 14% of the camera's image from its first corner" in text
 
 
 def test_a_cut_file_and_a_wrong_scale_are_noticed(

@@ -207,8 +207,44 @@ def test_a_run_in_water(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
     assert "expected one of index_excess, n, temperature, got 'density'" in capsys.readouterr().err
     assert run("export", out, "--out", tmp_path / "d.nc", "--medium", "water", "--water.ambient-c", 200) == 2
     assert "--water.ambient-c: expected 0.2 to 99 degrees C" in capsys.readouterr().err
+    assert run("export", out, "--out", tmp_path / "d.nc", "--medium", "mixture") == 2
+    assert "--medium: nothing follows from the field: the ambient index 1.3345 is not" in capsys.readouterr().err
+    assert run("reconstruct", path, "--out", tmp_path / "r", "--medium", "mixture", "--max-steps", 3) == 2
+    assert "--medium: the ambient index 1.3345 is not that of air" in capsys.readouterr().err
     assert run("export", out, "--out", tmp_path / "d.nc", "--second", out, "--medium", "plasma") == 2
     assert "--second: expected results at two wavelengths, got 532 and 532 nm" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("head", "ambient", "message"),
+    [
+        ("temperature [F],n", 68, r"expected temperature in k or c or °c or celsius or degc, got 'f'"),
+        ("temperature,n", 20, r"expected a unit, temperature \[C\] or temperature \[K\], got none"),
+        ("density [g/cm3],n", 20, r"expected density in kg/m3 .*, got 'g/cm3'"),
+        ("salinity [%],n", 20, r"expected salinity in g/kg, got '%'"),
+    ],
+)
+def test_tables_in_other_units_are_refused(tmp_path: Path, head: str, ambient: float, message: str) -> None:
+    path = tmp_path / "table.csv"
+    path.write_text(f"{head}\n20,1.00027\n120,1.0002\n", encoding="utf-8")
+    with pytest.raises(InputError, match=message):
+        TableSettings(file=path, ambient=ambient)
+
+
+def test_a_value_in_another_unit_than_the_tables_is_refused(tmp_path: Path) -> None:
+    """20 degrees C stated as 293.15 is in the table of a furnace, but its index is not that around the flow."""
+    path = tmp_path / "table.csv"
+    path.write_text("temperature [C],n\n0,1.000290\n20,1.00027\n500,1.0001\n", encoding="utf-8")
+    assert not TableSettings(file=path, ambient=20).not_around(1.00027)
+    assert "is not that of" in TableSettings(file=path, ambient=293.15).not_around(1.00027)
+
+
+def test_celsius_and_the_ambient_of_the_laboratory_in_a_tunnel() -> None:
+    with pytest.raises(InputError, match=r"total_temperature_k: expected K, from 100 on, got 27; add 273.15"):
+        IsentropicSettings(total_temperature_k=27.0)
+    lines = IsentropicSettings(mach=2.0).remarks(volume(np.zeros(24), N_AIR))
+    assert any("is n_ambient that of the laboratory" in line for line in lines)
+    assert not any("laboratory" in line for line in IsentropicSettings().remarks(volume(np.zeros(24), N_AIR)))
 
 
 def test_two_results_at_two_wavelengths(tmp_path: Path) -> None:

@@ -38,7 +38,7 @@ from nerif.forward.forward_model import ForwardModel
 from nerif.forward.path_integral import PathIntegral
 from nerif.forward.registry import forward_model
 from nerif.geometry import Camera, Grid
-from nerif.geometry.plausibility import rig_findings, suspects
+from nerif.geometry.plausibility import in_one_plane, rig_findings, suspects
 from nerif.reconstruction.aperture import apply_aperture
 from nerif.reconstruction.device import on_free_cores
 from nerif.reconstruction.gauge import ambient_faces
@@ -136,6 +136,8 @@ def check_consistency(
         corrections |= one.corrections
         findings += [replace(finding, sentence=prefix + finding.sentence) for finding in one.findings]
         remarks += [prefix + remark for remark in one.remarks]
+    if views and (note := in_one_plane(measurement.cameras)):
+        remarks.append(note)
     worst = [finding for finding in findings if finding.code == "unrelated"]
     others = [finding for finding in findings if finding.code != "unrelated"]
     return Consistency(tuple(views), (*worst, *rig, *others), tuple(remarks), corrections)

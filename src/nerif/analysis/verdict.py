@@ -156,7 +156,7 @@ def verdict(result: Result) -> Verdict:
         doubt, severe = "; ".join(filter(None, (uneven, doubt))), severe or not_symmetric
     time, common = time_of_fit(result), COMMON_MOTION if is_fitted("calibration", result.settings) else ""
     if severe:
-        return Verdict.of("do not use", None, [cut or doubt, "" if cut else remedy])
+        return Verdict.of("do not use", None, [cut or doubt, "" if cut or "nerif check" in doubt else remedy])
     if estimate is not None and estimate.error > MAX_CARE:
         return Verdict.of("do not use", estimate, [common, cut or doubt, "" if cut else remedy, time])
     if cut:  # no estimate includes what lies outside the images

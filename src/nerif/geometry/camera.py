@@ -176,9 +176,12 @@ class Camera:
         """Refuse a distortion that cannot be inverted, or interfaces that block the rays, over most of the image."""
         unseen = self.unseen
         if unseen > 0.5 and self.interfaces and replace(self, interfaces=()).unseen <= 0.5:
+            axis = self.rotation[2]
+            at = [float((p.offset - p.normal @ self.centre) / (p.normal @ axis)) for p in self.interfaces]
             raise InputError(
-                "expected planes in front of the camera in the order in which its rays cross them, got another order "
-                f"or total reflection over {unseen:.0%} of the image",
+                "expected planes in front of the camera in the order in which its rays cross them, got planes that its "
+                f"axis meets {', '.join(f'{distance:.4g}' for distance in at)} mm from it (negative: behind it), or "
+                f"total reflection, over {unseen:.0%} of the image",
                 field=f"interfaces of view '{self.name}'",
             )
         if unseen > 0.5:

@@ -23,6 +23,7 @@ from nerif.geometry.rays import Rays
 __all__ = [
     "Suspect",
     "background_cuts",
+    "in_one_plane",
     "interface_cuts",
     "likely_cause",
     "rays_on_lattice",
@@ -30,12 +31,21 @@ __all__ = [
     "suspects",
 ]
 
+FLAT = 0.05  # rms component of the optical axes across a plane, below which they lie in it
 MIN_EDGE, MAX_EDGE = 1.0, 1e4  # mm, of the longest edge of a box
 PIXELS, COARSE_PIXELS = 33, 9  # along an edge of an image that are traced, alone and for a comparison of views
 RAY_POINTS = 65  # along a ray
 BOX_POINTS = 9  # along an edge of the box
 MIN_OVERLAP = 0.1  # of rays with the box, and of the box with the image: a camera with less of both looks past it
 MARGIN = 0.1  # around an image, over its size, in which a point counts as visible to two views
+
+
+def in_one_plane(cameras: Sequence[Camera]) -> str:
+    """Return a note on cameras that look along one plane; "" if they do not, or are single."""
+    axes = torch.stack([camera.rotation[2] for camera in cameras])
+    if len(axes) < 2 or float(torch.linalg.svdvals(axes)[-1]) > FLAT * len(axes) ** 0.5:
+        return ""
+    return "the cameras look along one plane, so images that are all upside down agree as well: look at one of them"
 
 
 @dataclass(frozen=True)

@@ -34,6 +34,7 @@ __all__ = ["IsentropicSettings"]
 
 COMPRESSED = 1.05  # density over that of the stream, from which a shock may have lost total pressure
 ABOVE_TOTAL = 0.02  # of the total density that noise explains
+UNLIKE = 0.2  # relative difference of the density by n_ambient from that of the stream
 COLDEST = 30.0  # K, below which air condenses even in the short time of a nozzle
 PASSED = 0.5  # of the jump of density at the shock, from which on gas has passed it
 
@@ -118,7 +119,14 @@ class IsentropicSettings(Medium):
         if self.not_around(n_ambient):
             return lines
         mach = self.stream_mach(n_ambient)
-        lines.append(f"stream: Mach {mach:.3g}, density {self.stream_density(n_ambient):.4g} kg/m3")
+        stream = self.stream_density(n_ambient)
+        lines.append(f"stream: Mach {mach:.3g}, density {stream:.4g} kg/m3")
+        of_index = (n_ambient - 1) / self._constant
+        if abs(of_index - stream) > UNLIKE * stream:
+            lines.append(
+                f"stream: n_ambient of the measurement is that of {of_index:.4g} kg/m3; is the Mach number right, or "
+                "is n_ambient that of the laboratory?"
+            )
         stated = self.shock_angle and self._normal(mach) > 1
         if stated:
             jump, loss = self._shock(self._normal(mach))

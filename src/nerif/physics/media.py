@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
-from typing import Any, Literal, Self
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 from nerif.common.conventions import InputError
 from nerif.common.settings import check_settings
+from nerif.data.quantity_names import INDEX
 from nerif.physics.gas import GasChanges, GasSettings
 from nerif.physics.isentropic import IsentropicSettings
 from nerif.physics.medium import Medium
@@ -15,6 +16,9 @@ from nerif.physics.mixture import MixtureSettings
 from nerif.physics.plasma import PlasmaSettings
 from nerif.physics.table import TableSettings
 from nerif.physics.water import WaterSettings
+
+if TYPE_CHECKING:
+    from nerif.data.measurement import Measurement
 
 __all__ = ["MEDIA", "MediumChanges", "MediumSettings", "stored_medium"]
 
@@ -70,6 +74,13 @@ class MediumSettings(_Media):
         """The medium with its settings."""
         medium: Medium = getattr(self, self.medium)
         return medium
+
+    def check_around(self, measurement: Measurement) -> None:
+        """Refuse a stated medium that is not around the flow of a measurement: nothing would follow from its field."""
+        if self.medium == "gas" or measurement.quantity != INDEX:
+            return
+        if reason := self.substance.not_around(measurement.n_ambient):
+            raise InputError(reason, field="medium")
 
     def with_substance(self, medium: Medium) -> Self:
         """Return the settings with others of the medium in use."""

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 __all__ = ["Medium", "derive", "derive_all", "deviation", "masked_lines"]
 
 LEAST_PRESSURE, LEAST_WAVELENGTH = 100.0, 100.0  # Pa and nm; smaller ones are in bar and µm
+LEAST_TEMPERATURE = 100.0  # K of a gas around a flow; lower ones are degrees Celsius
 STEP = 1e-4  # of the largest index excess, for derivatives
 LEAST_STEP = 1e-9  # index
 
@@ -61,7 +62,7 @@ class Medium(ABC):
         if excess.quantity != INDEX:
             return {}
         reason = self.not_around(float(excess.attributes["n_ambient"]))
-        return dict.fromkeys(self.names, reason) if reason else {}
+        return dict.fromkeys((q for q in self.available(INDEX) if q in self.names), reason) if reason else {}
 
     def remarks(self, excess: Volume) -> list[str]:
         """Return lines on the quantities that do not follow from a field."""
@@ -71,9 +72,9 @@ class Medium(ABC):
             for reason in dict.fromkeys(absent.values())
         ]
 
-    def assumed(self, excess: Volume) -> list[str]:
-        """Return a line on each relation that gives quantities of a field, with what it assumes."""
-        texts = {q: self.assumption(q) for q in self.quantities_of(excess) if q in self.names}
+    def assumed(self, quantities: Sequence[str]) -> list[str]:
+        """Return a line on each relation that gives some quantities, with what it assumes."""
+        texts = {q: self.assumption(q) for q in quantities if q in self.names}
         distinct = dict.fromkeys(texts.values())
         whole = [text for text in distinct if not any(text in other for other in distinct if other != text)]
         return [f"{', '.join(q for q, part in texts.items() if part in text)}: {text}" for text in whole]
@@ -117,9 +118,10 @@ def check_wavelength(value: float, name: str = "wavelength_nm") -> None:
 
 
 def check_temperature(value: float, name: str) -> None:
-    """Refuse a temperature that is not above 0 K."""
-    if not 0 < value < math.inf:
-        raise InputError(f"expected K, above 0, got {value:g}; add 273.15 to degrees Celsius", field=name)
+    """Refuse a temperature in degrees Celsius."""
+    if not LEAST_TEMPERATURE <= value < math.inf:
+        least = f"{LEAST_TEMPERATURE:g}"
+        raise InputError(f"expected K, from {least} on, got {value:g}; add 273.15 to degrees Celsius", field=name)
 
 
 def derive(excess: Volume, quantity: str, medium: Medium) -> Volume:

@@ -21,7 +21,12 @@ __all__ = ["TableSettings"]
 MEASURED = ("temperature", "mole_fraction", "mass_fraction", "salinity", "density")
 LIGHT = ("wavelength", "wavelength_nm")
 CELSIUS = ("c", "°c", "celsius", "degc")
-OTHER = 0.05  # difference of the ambient index from that of the table
+OTHER = 0.15  # relative difference of n_ambient - 1 from that of the table
+UNITS = {
+    "temperature": ("k", *CELSIUS), "salinity": ("g/kg",), "density": ("kg/m3", "kg/m^3", "kg m-3"),
+    "mole_fraction": ("1",), "mass_fraction": ("1",),
+}  # fmt: skip
+COLD = 200.0  # K: a table without a unit that begins below is in another
 
 
 @dataclass(frozen=True)
@@ -87,7 +92,7 @@ class TableSettings(Tabulated):
 
     def not_around(self, n_ambient: float) -> str:
         expected = float(np.interp(self.ambient_value(""), *self.curve("")))
-        if abs(n_ambient - expected) <= OTHER:
+        if abs(n_ambient - expected) <= OTHER * abs(expected - 1):
             return ""
         return (
             f"the ambient index {n_ambient:.10g} is not that of {self.file} ({expected:.6f}); give the n_ambient of "
@@ -111,7 +116,12 @@ def _read(path: Path) -> tuple[str, bool, Float[np.ndarray, "n 3"]]:
         raise InputError(
             f"expected columns n and one of {', '.join(MEASURED)}, got {', '.join(names) or 'no names'}", field=path
         )
-    celsius = name == "temperature" and table.units[names.index(name)].lower() in CELSIUS
+    unit = table.units[names.index(name)].lower()
+    if unit and unit not in UNITS[name]:
+        raise InputError(f"expected {name} in {' or '.join(UNITS[name])}, got '{unit}'", field=path)
+    celsius = name == "temperature" and unit in CELSIUS
+    if name == "temperature" and not unit and float(np.nanmin(table.values[:, names.index(name)])) < COLD:
+        raise InputError("expected a unit, temperature [C] or temperature [K], got none", field=path)
     q, n = table.values[:, names.index(name)], table.values[:, names.index("n")]
     light = next((table.values[:, names.index(key)] for key in LIGHT if key in names), np.full(len(q), np.nan))
     rows = np.stack([q + ZERO_CELSIUS * celsius, n, light], axis=-1)

@@ -69,7 +69,7 @@ class Experiment(ExperimentSettings):
         truth = folder / "truth"
         truth.mkdir(parents=True, exist_ok=True)
         with OwnFiles(truth).writing("calibration.toml") as path:
-            write_cameras(path, [CalibratedCamera.from_camera(c) for c in cameras])
+            write_cameras(path, [CalibratedCamera.from_camera(c) for c in cameras], box=box)
         grid = Grid.of_resolution(box, truth_voxels)
         with OwnFiles(truth).writing("volume.nc") as path:
             write_netcdf(path, [Volume(phantom.sample(grid), grid, attributes={"n_ambient": n_ambient})])

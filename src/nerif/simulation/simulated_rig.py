@@ -32,8 +32,8 @@ class SimulatedRig(Checked):
             return self.ring.cameras(self.f_number)
         from nerif.imaging.calibration.importers.importers import import_cameras
 
-        if self.f_number or self.ring != Ring():
-            raise InputError(
-                "expected without --f-number and options of a ring, which the file replaces", field="calibration"
-            )
+        changed = [name for name, value in vars(self.ring).items() if value != getattr(Ring(), name)]
+        if changed := changed + ["f_number"] * bool(self.f_number):
+            names = ", ".join(f"--{name.replace('_', '-')}" for name in changed)
+            raise InputError(f"expected without {names}, which the file replaces", field="calibration")
         return tuple(camera.camera() for camera in import_cameras(self.calibration))

@@ -167,6 +167,7 @@ class ReconstructionRun:
         check_written(Grid.of_resolution(inputs.box, voxels))
         trials, budget = Trials(settings.uncertainty), Budget.of(reconstructor, inputs.training, voxels, since)
         settings = settings.with_substance(settings.substance.for_measurement(inputs.measurement))
+        settings.check_around(inputs.measurement)
         for line in inputs.remarks:
             monitor.say(line)
         if settings.detail == "on":

@@ -188,7 +188,7 @@ def write_field(run: ReconstructionRun, so_far: StepOutputs) -> StepOutputs:
         volumes = all_quantities(replace(result, field=field), run.settings.substance, run.voxels)
         out.write_volumes(volumes)
     medium = run.settings.substance
-    for line in (*medium.assumed(volumes[0]), *masked_lines(volumes), *medium.remarks(volumes[0])):
+    for line in (*medium.assumed([v.quantity for v in volumes]), *masked_lines(volumes), *medium.remarks(volumes[0])):
         say(line)
     out.write_metrics(  # without the sections of an earlier field
         Metrics(

@@ -102,6 +102,8 @@ def run(settings: Export) -> None:
     with counting_bar("sampling the field"):
         reconstruction, medium = result.sample(grid), settings.medium.of(result.settings())
     absent = medium.absent(reconstruction)
+    if settings.medium.medium and absent and not {*medium.quantities_of(reconstruction)} & {*medium.names}:
+        raise InputError(f"nothing follows from the field: {next(iter(absent.values()))}", field="medium")
     for name in settings.quantities:
         if name in absent:
             raise InputError(f"{name} does not follow from the field: {absent[name]}", field="quantities")
@@ -110,7 +112,10 @@ def run(settings: Export) -> None:
     export(settings.out, volumes, settings.force)
     names = ", ".join(v.quantity for v in volumes)
     say(f"{settings.out}: {names} on {' x '.join(map(str, grid.shape))} voxels (z, y, x)")
-    for line in (*medium.assumed(reconstruction), *masked_lines(volumes), *medium.remarks(reconstruction)):
+    written = [v.quantity for v in volumes]
+    unwritten = {*medium.optional} - {*written}
+    remarks = [line for line in medium.remarks(reconstruction) if line.partition(":")[0] not in unwritten]
+    for line in (*medium.assumed(written), *masked_lines(volumes), *remarks):
         say(line)
 
 

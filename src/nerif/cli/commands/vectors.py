@@ -64,6 +64,7 @@ class Vectors(Settings):
 def run(settings: Vectors) -> Measurement:
     """Write the measurement, or the film, of which a complete frame is returned."""
     from nerif.geometry import Box
+    from nerif.geometry.plausibility import in_one_plane
     from nerif.imaging.vectors.vectors import VectorFilm
 
     out, image = settings.out, settings.out.with_suffix(".png")
@@ -81,6 +82,8 @@ def run(settings: Vectors) -> Measurement:
         first = view.map(settings.frame if settings.frame < len(vectors) else 0)
         stated = "" if first.window else ": assumed, two steps of the grid (--window states it)"
         say(f"a vector on every {first.step[0]:.4g} x {first.step[1]:.4g} px, window {first.windowed:.4g} px{stated}")
+        for doubt in first.doubts(view.camera):
+            say(f"note: {view.name}: {doubt}")
     if film:
         if settings.average != 1:
             raise InputError("expected none for a film, got one; write one instant to a .nc file", field="average")
@@ -107,7 +110,9 @@ def run(settings: Vectors) -> Measurement:
 
     save_displacements(image, measurement)
     say(f"{out}: measurement of {len(measurement.names)} views; {image}: its displacements")
-    say(f"next: nerif check {quoted(word_of(out))}, which confirms signs and axes")
+    say(f"next: nerif check {quoted(word_of(out))}, which compares the axes of the views with one another")
+    if note := in_one_plane(measurement.cameras):
+        say(f"note: {note} in {image}, and give --y-axis if it is")
     return measurement
 
 

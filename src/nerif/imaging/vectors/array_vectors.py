@@ -25,8 +25,6 @@ SESSION = {"smoothed": (9, 10), "filtered": (6, 7), "original": (2, 3)}
 TYPES = {"filtered": 8, "original": 4}
 """Rows of PIVlab's resultslist, from 0: u, v, and the type of each vector; x and y are 0 and 1."""
 MIN_ROWS = 5
-UP = (1.5, -0.5)
-"""First pixel of PIVlab along x and y where y was calibrated upwards: y' = height - y."""
 
 
 def read_array_vectors(path: Path, settings: VectorSettings) -> list[ProgramVectors]:
@@ -88,7 +86,6 @@ def _export(content: Mapping[str, Any], path: Path) -> Iterator[ProgramVectors]:
         yield ProgramVectors.of_maps(
             PIVLAB, (x[i], y[i], u, v, valid), position_unit=position, vector_unit=vector, y_up=up,
             scale=1e3 * calxy if position != "px" else 0.0, time_step=calxy / calu if vector.endswith("/s") else 0.0,
-            first_pixel=UP if up else None,
         )  # fmt: skip
 
 

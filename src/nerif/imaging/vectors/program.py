@@ -5,6 +5,7 @@ All vectors point from the first image to the second.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -32,11 +33,12 @@ class Program:
     lag: float | None
     """Share of the displacement from the position of a vector to that on the second image; None: it is on the flow
     image, whichever was first."""
+    lowest_pixel: float | None = None  #: coordinate of the centre of the last row where y is up; None: as the first
 
 
 # Sources: PIVlab +piv/piv_FFTmulti.m, +export/file_save.m, mat_file_save.m, save_session_function.m; OpenPIV tools.py,
 # pyprocess.py, windef.py; DaVis lvpyio types/frame.py, plot_utils.py; the heads of the files of Insight, Dynamic Studio
-PIVLAB = Program("PIVlab", 1.5, 1.0)
+PIVLAB = Program("PIVlab", 1.5, 1.0, lowest_pixel=-0.5)  # with y up, y' = height - y
 OPENPIV = Program("OpenPIV", 0.5, MIDDLE)
 DAVIS = Program("DaVis", 0.5, MIDDLE)
 INSIGHT = Program("Insight", 0.5, MIDDLE)
@@ -47,6 +49,7 @@ TABLE = Program("a table", 0.0, None)
 def length_unit(text: str) -> str:
     """Return a unit of a file by its name in VectorSettings: px, mm, m/s, ...; "" if unknown."""
     unit = text.strip().lower().replace("/frame", "") or text.strip().lower()
+    unit = re.sub(r"[ .*]*s(\^|\*\*)?-1$|[ .*]s⁻¹$", "/s", unit)
     if unit in PIXELS:
         return "px"
     return unit if unit in LENGTHS or unit in RATES else ""
@@ -71,7 +74,6 @@ class ProgramVectors:
     origin: tuple[float, float] | None = None  #: pixel of x = y = 0 of positions in units of length
     sigma: Float[np.ndarray, "n 2"] | None = None  #: standard deviation in the unit of the vectors
     window: float = 0.0  #: px; 0 if unknown
-    first_pixel: tuple[float, float] | None = None  #: x, y of its centre, px; None: as the program's
     replaced: str = ""  #: what the file says and the user states otherwise
 
     @classmethod
@@ -127,7 +129,9 @@ class ProgramVectors:
         flow_first : whether the vectors point from the image with flow to the one without
         """
         scale = self._mm_per_unit_and_pixel(place)
-        first = np.array(self.first_pixel or (self.program.first_pixel,) * 2)
+        first = np.full(2, self.program.first_pixel)
+        if self.y_up and self.program.lowest_pixel is not None:
+            first[1] = self.program.lowest_pixel
         position = np.stack([self.x, self.y], axis=-1).astype(np.float64)
         if self.position_unit != "px":
             position *= LENGTHS[self.position_unit] / scale

@@ -63,7 +63,18 @@ def read_text_vectors(path: Path, settings: VectorSettings) -> ProgramVectors:
         program = TABLE if table.names else OPENPIV
     columns = _columns(table, settings, path)
     x, y, u, v = (table.values[:, columns[name]] for name in "xyuv")
-    units = {name: length_unit(table.units[columns[name]]) if table.units else "" for name in ("x", "u")}
+    if program is PIVLAB and np.any(np.diff(x[y == y[0]]) < 0):
+        raise InputError("expected x to the right, got x to the left; set the axis in PIVlab's calibration", field=path)
+    units = {"x": "", "u": ""}
+    for name, stated in (("x", settings.position_unit), ("u", settings.vector_unit)):
+        text = table.units[columns[name]] if table.units else ""
+        units[name] = length_unit(text)
+        if text and not units[name] and not stated:
+            option = "--position-unit" if name == "x" else "--vector-unit"
+            raise InputError(
+                f"expected px, {', '.join((*LENGTHS, *RATES))}, got the unit '{text}' of {name}; give {option}",
+                field=path,
+            )
     missing = np.zeros(len(x), dtype=bool)
     for i, name in enumerate(table.names):
         if (test := MISSING.get(role(name))) is not None and not settings.columns:

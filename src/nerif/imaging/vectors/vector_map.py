@@ -28,6 +28,7 @@ UNEVEN = 0.1  # of the step, by which a position may be off the grid
 SQUARE = 0.02  # relative difference of the steps along x and y
 LARGEST = 10  # ratio of grid points to vectors, above which the positions are no grid
 MIN_DIFFERENCES = 16
+LARGE, COVERED, CORNER, MOST_STEPS = 0.9, 0.6, 0.1, 8  # quantile of displacements, parts of an image, of a window
 OVERLAP = 2.0  # windows overlap by half where nothing is stated
 FLOOR = (
     0.01  # px of the images, least standard deviation of a vector: displacements by correlation lock to whole pixels
@@ -110,6 +111,27 @@ class VectorMap:
         """Return displacement and sigma in steps of the grid."""
         step = np.asarray(self.step, dtype=np.float32)
         return self.displacement / step, None if self.sigma is None else self.sigma / step
+
+    def doubts(self, camera: CalibratedCamera) -> list[str]:
+        """Return what is implausible, as of a wrong scale, window or calibration, a line each."""
+        rows, columns = self.displacement.shape[:2]
+        lines, largest = [], float(np.nanquantile(np.abs(self.displacement), LARGE))
+        if largest > self.windowed:
+            lines.append(
+                f"displacements of {largest:.3g} px exceed the window of {self.windowed:.3g} px; check --scale, "
+                "--time-step and units"
+            )
+        if self.window and not 1 <= self.window <= MOST_STEPS * self.pixel:
+            lines.append(f"a window of {self.window:g} px with a vector on every {self.pixel:.3g} px; check --window")
+        if camera.image_size is not None:
+            ends = [o + s * n for o, s, n in zip(self.origin, self.step, (columns, rows), strict=True)]
+            shares = [end / size for end, size in zip(ends, reversed(camera.image_size), strict=True)]
+            if max(shares) < COVERED and max(self.origin) < CORNER * min(camera.image_size):
+                lines.append(
+                    f"vectors cover {shares[0]:.0%} x {shares[1]:.0%} of the camera's image from its first corner; "
+                    "were the images of the calibration larger, or is --scale too large?"
+                )
+        return lines
 
     def camera(self, camera: CalibratedCamera, place: object) -> Camera:
         """Return the camera whose pixels are the vectors, and average over their windows.

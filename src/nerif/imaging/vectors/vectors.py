@@ -275,10 +275,11 @@ def _frames_by_view(source: Path, settings: VectorSettings, cameras: Sequence[st
                 field=source,
             )
         return {name: (partial(_same, vectors),) for name, vectors in zip(cameras, maps, strict=True)}
+    depths = ("*", "*/*", "*/*/*")
+    has = {ending(path) for depth in depths for path in source.glob(depth)}
     files = {name: paths for name, paths in _files(source, cameras).items() if paths}
-    if not files:
-        images = any(ending(path) in FOLDER_SUFFIXES for path in (*source.glob("*"), *source.glob("*/*")))
-        got = "images; nerif displacement evaluates those" if images else "none"
+    if not files or (has & {*FOLDER_SUFFIXES} and not has & {*TEXT, *DAVIS, ".mat", ".npz"}):
+        got = "images; nerif displacement evaluates those" if has & {*FOLDER_SUFFIXES} else "none"
         raise InputError(f"expected files of vectors ({' '.join(ENDINGS)}) for each view, got {got}", field=source)
     return {name: tuple(f for path in paths for f in _of_file(path, settings)) for name, paths in files.items()}
 
