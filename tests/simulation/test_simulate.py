@@ -80,7 +80,7 @@ def test_cameras_of_a_calibration_are_simulated_with_their_windows(tmp_path, cap
     assert float((d - near).norm() / d.norm()) < 0.02
     assert float((d - far).norm() / d.norm()) > 0.04
     assert run("simulate", "--out", tmp_path / "n.nc", *words, "--views", 3) == 2
-    assert "--calibration: expected without --f-number and options of a ring" in capsys.readouterr().err
+    assert "--calibration: expected without --views, which the file replaces" in capsys.readouterr().err
 
 
 def test_views_of_different_size_are_padded_with_nan(ball, box):

@@ -121,8 +121,8 @@ class CameraBundle:
         x, y, _ = tilt(*distort(image[:, 0], image[:, 1], k[4:9])[:2], k[9:])
         return np.stack([k[0] * x + k[2], k[1] * y + k[3]], axis=1)
 
-    def derivatives(self, o: TargetObservation) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the derivatives (2 n, p) of u, v of each point by intrinsics, camera pose and target pose."""
+    def derivatives(self, o: TargetObservation) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Return the points (n, 2), px, and derivatives (2 n, p) of u, v by intrinsics, camera pose and target pose."""
         k, pose = self.intrinsics[o.camera], self.poses[o.pose]
         turned = o.detection.points @ pose.rotation.T
         image, slope, by_camera = self._image_slopes(o.camera, turned + pose.translation)
@@ -143,7 +143,8 @@ class CameraBundle:
             by_distorted @ coefficients,
             k[:2, None] * _rows(*tilt_slopes(xd, yd, k[9:])),
         ], axis=-1).reshape(-1, INTRINSIC)  # fmt: skip
-        return by_intrinsics, (by_image @ by_camera).reshape(-1, POSE), by_pose
+        pixels = np.stack([k[0] * xt + k[2], k[1] * yt + k[3]], axis=1)
+        return pixels, by_intrinsics, (by_image @ by_camera).reshape(-1, POSE), by_pose
 
     def _image_slopes(self, i: int, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return (x, y) of points (n, 3) of the world, and its slopes (n, 2, 3) by the point, (n, 2, 6) by the pose."""
@@ -297,8 +298,8 @@ class _ParameterOrder:
         bundle = self.unpack(x)
         curvature, slope, cost = np.zeros((self.size, self.size)), np.zeros(self.size), 0.0
         for o in self.observations:
-            by_intrinsics, by_camera, by_pose = bundle.derivatives(o)
-            residual = -bundle.residual(o)
+            pixels, by_intrinsics, by_camera, by_pose = bundle.derivatives(o)
+            residual = pixels - o.detection.pixels
             length = np.linalg.norm(residual, axis=1)
             cost += self._loss(length)
             weight = np.repeat(np.sqrt(np.minimum(1, HUBER * self.noise / np.maximum(length, 1e-12))), 2)
