@@ -39,6 +39,7 @@ def result(five: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
+@pytest.mark.slow
 def test_the_velocity_improves_the_densities_if_the_measurement_is_there(result: Path, five: Path, tmp_path: Path):
     copy = Path(shutil.copytree(result, tmp_path / "copy.zarr"))
     zarr.open_group(copy, mode="r+").attrs["measurement"] = str(tmp_path / "gone.zarr")
