@@ -10,7 +10,7 @@ import torch
 from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
 from nerif.geometry import Box, Camera, Plane, Ring, paper_rig
-from nerif.geometry.plausibility import likely_cause, rig_findings
+from nerif.geometry.plausibility import in_one_plane, likely_cause, rig_findings
 
 BOX = Box((-25.0, -20.0, -15.0), (20.0, 25.0, 30.0))
 
@@ -147,3 +147,10 @@ def test_a_file_that_is_refused_says_why():
         Measurement(tuple(to_world(c) for c in ring()), zero, BOX, 1.00027)
     with pytest.raises(InputError, match=r"background of view.*likely translation and background_offset in metres"):
         Measurement(tuple(all_in_metres(c) for c in ring()), zero, BOX, 1.00027)
+
+
+@pytest.mark.parametrize("views", [1, 2, 5])
+def test_cameras_that_look_along_one_plane(views):
+    ring = Ring(views=views, arc=(0.0, 120.0))
+    assert bool(in_one_plane(ring.cameras())) == (views > 1)
+    assert not in_one_plane(replace(ring, elevation=15.0).cameras())

@@ -147,6 +147,21 @@ def test_targets_seen_through_windows_give_the_rig_back(tmp_path, behind):
         assert turns(ignored, cameras).max() > 20 * turns(result, cameras).max()
 
 
+@pytest.mark.parametrize("case", ["order", "behind the camera", "behind the targets"])
+def test_windows_that_the_rays_do_not_cross_are_refused(case):
+    cameras = through_windows(CAMERAS, 1.0)
+    views = target_images(cameras, TARGET, 0, 10, 0)
+    windows = {camera.name: camera.interfaces for camera in cameras}
+    first = cameras[0]
+    near, far = first.interfaces
+    windows[first.name] = {
+        "order": (far, near), "behind the camera": (replace(near, offset=5000.0),),
+        "behind the targets": (replace(near, offset=-400.0),),
+    }[case]  # fmt: skip
+    with refused(f"interfaces of view '{first.name}'"):
+        calibrate(views, SETTINGS["perspective"], 480.0, windows)
+
+
 def test_windows_in_front_of_telecentric_targets_are_refused():
     planes = {NAMES[0]: (Interface(torch.tensor([1.0, 0, 0]), 100.0, 1.5),)}
     with refused("interfaces"):

@@ -229,7 +229,7 @@ def test_refused_folders(rig: Rig, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="scale: expected none for positions in px and vectors in px"):
         nerif.read_vectors(tmp_path, rig.calibration, VectorSettings(scale=0.1))
     with pytest.raises(InputError, match="window: expected less than the edge of the images"):
-        nerif.read_vectors(tmp_path, rig.calibration, VectorSettings(window=100.0))
+        nerif.read_vectors(tmp_path, rig.calibration, VectorSettings(window=180.0))
     (tmp_path / "photos").mkdir()
     (tmp_path / "photos" / "cam1.tif").touch()
     with pytest.raises(InputError, match="got images; nerif displacement evaluates those"):

@@ -41,9 +41,11 @@ MARGIN = 0.1  # around an image, over its size, in which a point counts as visib
 
 
 def in_one_plane(cameras: Sequence[Camera]) -> str:
-    """Return a note on cameras that look along one plane; "" if they do not, or are single."""
-    axes = torch.stack([camera.rotation[2] for camera in cameras])
-    if len(axes) < 2 or float(torch.linalg.svdvals(axes)[-1]) > FLAT * len(axes) ** 0.5:
+    """Return a note on cameras that look along one plane, the columns of their images across it; "" if they do not."""
+    axes, columns = (torch.stack([camera.rotation[i] for camera in cameras]) for i in (2, 1))
+    least, normals = torch.linalg.eigh(axes.T @ axes)
+    upright = (columns @ normals[:, 0]).abs().min() > 1 - FLAT
+    if len(axes) < 2 or float(least[0]) > FLAT**2 * len(axes) or not bool(upright):
         return ""
     return "the cameras look along one plane, so images that are all upside down agree as well: look at one of them"
 

@@ -106,6 +106,8 @@ class IsentropicSettings(Medium):
         return math.sqrt(max(0.0, 2 / (self.gamma - 1) * (ratio ** (self.gamma - 1) - 1)))
 
     def not_around(self, n_ambient: float) -> str:
+        if not self.stream_density(n_ambient) > 0:
+            return f"the ambient index {n_ambient:.10g} is that of no gas; give --isentropic.mach"
         if self.stream_density(n_ambient) <= (1 + ABOVE_TOTAL) * self.total_density:
             return ""
         return (

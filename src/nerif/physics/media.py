@@ -106,10 +106,13 @@ class MediumChanges(_Media):
     def of(self, settings: Mapping[str, Any]) -> Medium:
         """Return the medium in the settings of a run (run.toml) with the changes."""
         self._check_unused(self.medium or "gas")
-        if self.medium and self.medium != "gas":
-            groups = {name: getattr(self, name) for name in MEDIA if name != "gas"}
-            return MediumSettings(medium=self.medium, **groups).substance
         stored = stored_medium(settings)
+        if self.medium and self.medium != "gas":
+            group = getattr(self, self.medium)
+            if not isinstance(stored, type(group)):
+                return replace(group)
+            values = {f.name: getattr(group, f.name) for f in fields(group)}
+            return replace(stored, **{k: value for k, value in values.items() if value != getattr(type(group)(), k)})
         if not self.medium and stored is not None and not isinstance(stored, GasSettings):
             return stored
         return self.gas.of(settings)

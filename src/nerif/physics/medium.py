@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 __all__ = ["Medium", "derive", "derive_all", "deviation", "masked_lines"]
 
 LEAST_PRESSURE, LEAST_WAVELENGTH = 100.0, 100.0  # Pa and nm; smaller ones are in bar and µm
-LEAST_TEMPERATURE = 100.0  # K of a gas around a flow; lower ones are degrees Celsius
+LEAST_TEMPERATURE = 60.0  # K of a gas around a flow; lower ones are degrees Celsius
 STEP = 1e-4  # of the largest index excess, for derivatives
 LEAST_STEP = 1e-9  # index
 

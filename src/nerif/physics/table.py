@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -20,12 +21,13 @@ __all__ = ["TableSettings"]
 
 MEASURED = ("temperature", "mole_fraction", "mass_fraction", "salinity", "density")
 LIGHT = ("wavelength", "wavelength_nm")
-CELSIUS = ("c", "°c", "celsius", "degc")
+CELSIUS = ("c", "degc", "celsius", "degreesc")
 OTHER = 0.15  # relative difference of n_ambient - 1 from that of the table
 UNITS = {
-    "temperature": ("k", *CELSIUS), "salinity": ("g/kg",), "density": ("kg/m3", "kg/m^3", "kg m-3"),
-    "mole_fraction": ("1",), "mass_fraction": ("1",),
+    "temperature": ("k", *CELSIUS), "salinity": ("g/kg", "gkg-1"), "density": ("kg/m3", "kgm-3"),
+    "mole_fraction": ("1", "-", "mol/mol"), "mass_fraction": ("1", "-", "kg/kg"),
 }  # fmt: skip
+"""Units without capitals, blanks and circumflexes."""
 COLD = 200.0  # K: a table without a unit that begins below is in another
 
 
@@ -116,7 +118,7 @@ def _read(path: Path) -> tuple[str, bool, Float[np.ndarray, "n 3"]]:
         raise InputError(
             f"expected columns n and one of {', '.join(MEASURED)}, got {', '.join(names) or 'no names'}", field=path
         )
-    unit = table.units[names.index(name)].lower()
+    unit = re.sub(r"[\s^]", "", table.units[names.index(name)].lower().replace("°", "deg").replace("³", "3"))
     if unit and unit not in UNITS[name]:
         raise InputError(f"expected {name} in {' or '.join(UNITS[name])}, got '{unit}'", field=path)
     celsius = name == "temperature" and unit in CELSIUS

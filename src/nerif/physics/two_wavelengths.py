@@ -2,7 +2,7 @@
 
     n_i - n_ambient,i = sum_k c_ik q_k,      q = C^-1 (n - n_ambient),      var(q) = (C^-1)^2 var(n)
 
-    gas and electrons    q = density - ambient density, electron density;    c = K(wavelength), -1 / (2 n_c)
+    gas and electrons    q = density less that of the ambient, electron density;    c = K(wavelength), -1 / (2 n_c)
     two gases            q = density of the one, change of the other's;      c = K_A, K_B
 
 Temperature and mole fraction of two gases at a uniform pressure, T = p / (R sum_k rho_k / M_k), follow from the latter.
@@ -48,7 +48,7 @@ def gas_and_electrons(
     fields: Sequence[Volume], wavelengths_nm: Sequence[float], composition: Composition = "air",
     stds: Sequence[Tensor] | None = None,
 ) -> list[Volume]:  # fmt: skip
-    """Return density (kg/m^3, relative to the ambient's) and electron density (m^-3), and their deviations if stated.
+    """Return density (kg/m^3) and electron density (m^-3), and their deviations if stated.
 
     Parameters
     ----------
@@ -58,8 +58,10 @@ def gas_and_electrons(
     """
     lights = _checked(fields, wavelengths_nm)
     matrix = np.array([[gladstone_dale(composition, w), -1 / (2 * critical_density(w))] for w in lights])
-    values, deviations = _solved(matrix, fields, stds)
-    return _volumes(fields[0], ("density", "electron_density"), values, deviations)
+    (change, electrons), deviations = _solved(matrix, fields, stds)
+    around = (float(fields[0].attributes["n_ambient"]) - 1) / matrix[0, 0]
+    about: dict[str, float | str] = {"gas": str(composition)}
+    return _volumes(fields[0], ("density", "electron_density"), (change + around, electrons), deviations, about)
 
 
 def two_gases(
@@ -99,7 +101,10 @@ def two_gases(
             ]).sum(dim=0).sqrt()
             for s in slopes
         )  # fmt: skip
-    return _volumes(fields[0], ("temperature", "mole_fraction"), values, results)
+    about: dict[str, float | str] = {
+        "jet": str(jet), "ambient": str(ambient), "ambient_temperature_k": temperature_k, "pressure_pa": pressure_pa,
+    }  # fmt: skip
+    return _volumes(fields[0], ("temperature", "mole_fraction"), values, results, about)
 
 
 def _checked(fields: Sequence[Volume], wavelengths_nm: Sequence[float]) -> tuple[float, ...]:
@@ -135,9 +140,11 @@ def _solved(
 
 
 def _volumes(
-    like: Volume, names: tuple[str, str], values: Sequence[Tensor], deviations: Sequence[Tensor] | None
-) -> list[Volume]:
-    volumes = [Volume(v.float(), like.grid, n, describe(n)[0]) for n, v in zip(names, values, strict=True)]
-    for name, std in zip(names, deviations or (), strict=False):
-        volumes.append(Volume(std.float(), like.grid, f"{name}_std", describe(f"{name}_std")[0]))
-    return volumes
+    like: Volume, names: tuple[str, str], values: Sequence[Tensor], deviations: Sequence[Tensor] | None,
+    about: dict[str, float | str],
+) -> list[Volume]:  # fmt: skip
+    whole = [*names, *(f"{name}_std" for name in names if deviations)]
+    return [
+        Volume(v.float(), like.grid, name, describe(name)[0], about)
+        for name, v in zip(whole, (*values, *(deviations or ())), strict=True)
+    ]

@@ -70,6 +70,8 @@ def run(settings: Export) -> None:
     from nerif.results.two_unknowns import two_unknowns
 
     over_time = ending(settings.result) == ".zarr"
+    if settings.second is not None and (over_time or settings.format != "field" or settings.quantities):
+        raise InputError("expected the field of two results, without --format and --quantities", field="second")
     endings = (*FORMATS, *(FOLDER_FORMATS if over_time else ()))
     check_output(settings.out, settings.force, endings=endings if settings.format == "field" else (".npz",))
     if settings.format != "field":
@@ -95,9 +97,11 @@ def run(settings: Export) -> None:
     grid = _grid(replace(settings, voxels=settings.voxels or result.settings().get("voxels", 0)), whole)
     if settings.second is not None:
         with counting_bar("sampling the fields"):
-            volumes = two_unknowns([result, ResultDirectory(settings.second)], grid, settings.medium.of({}))
+            medium = settings.medium.of(result.settings())
+            volumes = two_unknowns([result, ResultDirectory(settings.second)], grid, medium)
         export(settings.out, volumes, settings.force)
-        say(f"{settings.out}: {', '.join(v.quantity for v in volumes)}")
+        about = ", ".join(f"{name} {value}" for name, value in volumes[0].attributes.items())
+        say(f"{settings.out}: {', '.join(v.quantity for v in volumes)} ({about})")
         return
     with counting_bar("sampling the field"):
         reconstruction, medium = result.sample(grid), settings.medium.of(result.settings())

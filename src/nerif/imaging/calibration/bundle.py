@@ -177,6 +177,14 @@ class CameraBundle:
             interfaces=planes,
         )  # fmt: skip
 
+    def crosses_windows(self, o: TargetObservation) -> bool:
+        """Return whether the rays to all points of an observation cross the windows of its camera, in their order."""
+        if not (planes := self._planes(o.camera)):
+            return True
+        behind, points = self._behind(o.camera, planes), torch.from_numpy(self.poses[o.pose].apply(o.detection.points))
+        line = behind.line(behind.image_point(points))
+        return bool((((points - line.origin) * line.direction).sum(-1) >= 0).all())  # NaN: no ray
+
     def residual(self, o: TargetObservation) -> Float[np.ndarray, "n 2"]:
         """Return detected minus projected points, px."""
         return o.detection.pixels - self.project(o)

@@ -58,6 +58,7 @@ def calibrate_views(
     """
     background_target = target.scaled(background_scale)
     settings.check_names([view.name for view in views])
+    _check_perspective(settings, interfaces)
     target_images(views)  # reports missing images before the long work
     images = [f"{v.name}/{s}/{p}" for v in views for s in SOURCES if s in v.sources for p in pose_names(v.open(s))]
     check_known(leave_out, images, "leave_out", "image")
@@ -91,12 +92,16 @@ def calibrate(
         raise InputError("expected one folder of target images per camera, got no view", field="calibrate")
     names = [v.name for v in views]
     settings.check_names(names)
+    _check_perspective(settings, interfaces)
     if not settings.kind.shows_depth:
         views = [replace(v, background={}) for v in views]
     bundle, observations = first_guess(views, settings.coefficients, settings.world, settings.kind)
     bundle, _ = adjust(bundle, observations, INITIAL_NOISE)
     if interfaces:
-        bundle, _ = adjust(_behind(bundle, interfaces, names, settings), observations, INITIAL_NOISE)
+        bundle = _behind(bundle, interfaces, names, settings)
+        _check_windows(bundle, observations, names)
+        bundle, _ = adjust(bundle, observations, INITIAL_NOISE)
+        _check_windows(bundle, observations, names)
     fits = _fits(bundle, observations)
     consistent = [o for o, fit in zip(observations, fits, strict=True) if fit]
     _check_counts(views, consistent)
@@ -109,15 +114,32 @@ def calibrate(
     return result
 
 
+def _check_perspective(settings: CalibrationSettings, interfaces: Mapping[str, tuple[Interface, ...]]) -> None:
+    if interfaces and not settings.kind.shows_depth:
+        raise InputError(
+            f"expected perspective cameras for windows in front of targets, got {settings.projection}",
+            field="interfaces",
+        )
+
+
+def _check_windows(bundle: CameraBundle, observations: Sequence[TargetObservation], names: Sequence[str]) -> None:
+    """Refuse windows that are not between a camera and its targets."""
+    for o in observations:
+        if not bundle.crosses_windows(o):
+            source = "background" if o.on_background else "target"
+            raise InputError(
+                f"expected planes between the camera and its targets, in order from the camera, got others: rays to "
+                f"{names[o.camera]}/{source}/{o.image} do not cross them so; check normal, offset (mm) and order, in "
+                "the world frame",
+                field=f"interfaces of view '{names[o.camera]}'",
+            )
+
+
 def _behind(
     bundle: CameraBundle, interfaces: Mapping[str, tuple[Interface, ...]], names: Sequence[str],
     settings: CalibrationSettings,
 ) -> CameraBundle:  # fmt: skip
     """The bundle with windows, in the frame of the fixed target, which the result moves to the world."""
-    if not bundle.projection.shows_depth:
-        raise InputError(
-            "expected perspective cameras for windows in front of targets, got telecentric", field="interfaces"
-        )
     rotation, origin = torch.from_numpy(settings.rotation), torch.tensor(settings.origin, dtype=torch.float64)
     moved = tuple(
         tuple(

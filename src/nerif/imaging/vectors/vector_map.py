@@ -115,7 +115,10 @@ class VectorMap:
     def doubts(self, camera: CalibratedCamera) -> list[str]:
         """Return what is implausible, as of a wrong scale, window or calibration, a line each."""
         rows, columns = self.displacement.shape[:2]
-        lines, largest = [], float(np.nanquantile(np.abs(self.displacement), LARGE))
+        lines: list[str] = []
+        if not self.valid.any():
+            return lines
+        largest = float(np.nanquantile(np.abs(self.displacement), LARGE))
         if largest > self.windowed:
             lines.append(
                 f"displacements of {largest:.3g} px exceed the window of {self.windowed:.3g} px; check --scale, "
@@ -169,7 +172,7 @@ class VectorMap:
         change = torch.diag(torch.tensor([1 / self.step[0], 1 / self.step[1], 1.0], dtype=torch.float64))
         change[:2, 2] = -torch.tensor(self.origin, dtype=torch.float64) * change.diagonal()[:2]
         window = self.windowed / self.pixel
-        if self.window > min(n * s for n, s in zip((columns, rows), self.step, strict=True)):
+        if camera.image_size is not None and self.window > min(camera.image_size):
             raise InputError(f"expected less than the edge of the images, got {self.window:g} px", field="window")
         if window > MAX_WINDOW:
             raise InputError(

@@ -278,7 +278,7 @@ def _frames_by_view(source: Path, settings: VectorSettings, cameras: Sequence[st
     depths = ("*", "*/*", "*/*/*")
     has = {ending(path) for depth in depths for path in source.glob(depth)}
     files = {name: paths for name, paths in _files(source, cameras).items() if paths}
-    if not files or (has & {*FOLDER_SUFFIXES} and not has & {*TEXT, *DAVIS, ".mat", ".npz"}):
+    if not files or (has & {*FOLDER_SUFFIXES} and not has & {*TEXT, *DAVIS, ".mat"} and not {*files} & {*cameras}):
         got = "images; nerif displacement evaluates those" if has & {*FOLDER_SUFFIXES} else "none"
         raise InputError(f"expected files of vectors ({' '.join(ENDINGS)}) for each view, got {got}", field=source)
     return {name: tuple(f for path in paths for f in _of_file(path, settings)) for name, paths in files.items()}
