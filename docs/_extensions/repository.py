@@ -123,7 +123,14 @@ def on_include_read(app: Any, path: Path, parent: str, content: list[str]) -> No
         content[0] = relink(content[0], Path(os.path.normpath(docs / path.parent)), docs, app.nerif_modules)
 
 
+def forget_builtins(app: Any) -> list[tuple[str, dict[str, Any], str]]:
+    """Leave Python's own types, of which names such as Region are aliases, out of the list of sources."""
+    getattr(app.env, "_viewcode_modules", {}).pop("builtins", None)
+    return []
+
+
 def setup(app: Any) -> dict[str, bool]:
+    app.connect("html-collect-pages", forget_builtins, priority=400)  # before viewcode's
     app.connect("builder-inited", make_pages)
     app.connect("source-read", on_source_read)
     app.connect("include-read", on_include_read)
