@@ -254,6 +254,11 @@ def test_changes_to_the_medium_of_a_result_begin_with_it() -> None:
     assert MediumChanges(medium="plasma").of(stored) == PlasmaSettings()
 
 
+def test_a_gas_that_is_not_in_the_table_is_named_by_its_option() -> None:
+    with pytest.raises(InputError, match="ambient: expected gases out of"):
+        MixtureSettings(ambient="Xx")
+
+
 def test_celsius_and_the_ambient_of_the_laboratory_in_a_tunnel() -> None:
     with pytest.raises(InputError, match=r"total_temperature_k: expected K, from 60 on, got 27; add 273.15"):
         IsentropicSettings(total_temperature_k=27.0)

@@ -48,6 +48,11 @@ class MixtureSettings(Medium):
         check_pressure(self.pressure_pa, "pressure_pa")
         check_temperature(self.temperature_k, "temperature_k")
         check_wavelength(self.wavelength_nm)
+        for name in ("jet", "ambient"):
+            try:
+                molar_mass(getattr(self, name))
+            except InputError as error:
+                raise error.renamed({"composition": name}) from None
         jet, ambient = self._refractivities
         if abs(jet - ambient) < LIKE * ambient:
             raise InputError(

@@ -27,6 +27,7 @@ def two_unknowns(results: Sequence[ResultDirectory], grid: Grid, medium: Medium)
     """
     lights = []
     for result in results:
+        result.quantity()  # refuses what is no result
         entries = result.settings()
         name = str(entries.get("medium", "gas"))
         light = entries.get(name, {}).get("wavelength_nm") if name in MEDIA else None
