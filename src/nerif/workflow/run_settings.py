@@ -36,8 +36,8 @@ class RunSettings(MediumSettings):
     """Add detail that the field leaves in its data (docs/detail.md): on, off, or auto (for nerif and tv, where the
     residual is above the noise and the withheld view of the cross-validation is predicted better with it)."""
     uncertainty: Literal["off", "fast", "full"] = "off"
-    """Standard deviations of every quantity: off, fast (2 samples of the error) or full (8 samples); draws from the
-    posterior where detail is added, else bootstrap trials."""
+    """Standard deviations of every quantity: off, fast (2 samples of the error) or full (8 samples): draws from the
+    posterior where detail is added to the blurred field, else bootstrap trials."""
     report: bool = True
     """Write report.html at the end."""
     checkpoint_every: float = 60.0

@@ -2,7 +2,7 @@
 
     x = m + a h
 
-h is a homogeneous field with the spectrum of von Karman (voxels/prior.py). m is the reconstruction q, or q blurred
+h is a homogeneous field with the spectrum of von Karman (detail_prior.py). m is the reconstruction q, or q blurred
 where its own detail is wrong. a is the local rms of grad q, as detail lies where the field varies, or in a second pass
 the local rms of a h from a solution on a coarse grid. Its size explains what the residual has above the noise.
 
