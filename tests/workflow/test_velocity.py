@@ -232,7 +232,7 @@ def test_a_flow_that_moves_as_a_whole_has_its_velocity_and_water_has_no_density(
     store = VolumeSequence.create(film, TIMES, GRID, ("index_excess",), 1.333)
     for k, theta in enumerate(thetas):
         store.write(k, [Volume.of(-0.333 * theta, GRID, "index_excess", 1.333)])
-    assert run("velocity", film, "-o", tmp_path / "v.zarr", "--physics", "transport", "--frames", "0", "4", *ROUGH) == 0
+    assert run("velocity", film, "-o", tmp_path / "v.zarr", "--physics", "transport", "--frames", "0:4", *ROUGH) == 0
     velocity = VelocitySequence(tmp_path / "v.zarr")
     assert np.nanmean(velocity.read("u", 2)) == pytest.approx(0.3, rel=0.1)
     assert abs(np.nanmean(velocity.read("v", 2))) < 0.01
@@ -257,7 +257,7 @@ def test_a_velocity_that_does_not_explain_its_film_exits_with_1(film: Path, tmp_
     monkeypatch.setattr("nerif.report.velocity_page.image", lambda *_: "")
     monkeypatch.setattr("nerif.analysis.velocity_verdict.MOST_MISFIT", 0.01)
     monkeypatch.setattr("nerif.analysis.velocity_verdict.MISFIT", (0.005, 0.01))
-    assert run("velocity", film, "-o", tmp_path / "v.zarr", "--frames", "0", "3", *ROUGH) == 1
+    assert run("velocity", film, "-o", tmp_path / "v.zarr", "--frames", "0:3", *ROUGH) == 1
     printed = capsys.readouterr()
     assert "Do not use: the density changes" in printed.out + printed.err
     assert (tmp_path / "v.html").is_file()

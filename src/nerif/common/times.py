@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 
 from nerif.common.conventions import InputError
 
-__all__ = ["INTERVAL", "check_interval", "interval", "same_instants", "seconds", "whole_steps"]
+__all__ = ["INTERVAL", "check_interval", "frame_range", "interval", "same_instants", "seconds", "whole_steps"]
 
 Times = Float[np.ndarray, "frame"]
 Numbers = Int[np.ndarray, "frame"]
@@ -45,6 +45,17 @@ def whole_steps(times: Times) -> Numbers | None:
     if (np.abs(steps - np.rint(steps)) > UNEVEN).any():
         return None
     return np.concatenate([[0], np.rint(steps).astype(np.int64).cumsum()])
+
+
+def frame_range(text: str) -> tuple[int, int]:
+    """Return the first frame of FIRST:LAST, and the one after its last."""
+    try:
+        first, last = (int(word) for word in text.split(":"))
+        if not 0 <= first < last:
+            raise ValueError
+    except ValueError:
+        raise InputError(f"expected all, or FIRST:LAST such as 0:400, got '{text}'", field="frames") from None
+    return first, last
 
 
 def seconds(numbers: np.ndarray, units: object, field: str | Path) -> Times:

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from nerif.common.conventions import InputError
+from nerif.common.times import frame_range
 from nerif.data.measurement import Measurement
 from nerif.data.measurement_file import from_dataset
 from nerif.data.measurement_sequence import MeasurementSequence
@@ -76,12 +77,7 @@ def frame_numbers(text: str, views: Sequence[View]) -> tuple[int, ...]:
                 field="frames",
             )
         return tuple(common)
-    try:
-        first, last = (int(word) for word in text.split(":"))
-        if not 0 <= first < last:
-            raise ValueError
-    except ValueError:
-        raise InputError(f"expected all, or FIRST:LAST such as 0:400, got '{text}'", field="frames") from None
+    first, last = frame_range(text)
     for view in views:
         view.check_instants(range(first, last), "frames")
     return tuple(sorted(every & {*range(first, last)}))

@@ -11,6 +11,7 @@ from nerif.cli.output import MONITOR, figures_bar
 from nerif.cli.settings import Settings, command
 from nerif.common.conventions import InputError
 from nerif.common.settings import Flat, Positional
+from nerif.common.times import frame_range
 from nerif.data.quantity_names import INDEX
 from nerif.flow.velocity_settings import VelocitySettings
 
@@ -32,8 +33,8 @@ class Velocity(Settings):
     """Result of nerif sequence (.zarr), complete, or true fields over time."""
     out: Path
     """Velocity (.zarr) to write; its report lies beside it."""
-    frames: tuple[int, int] | None = None
-    """First frame, and the one after the last (default: all)."""
+    frames: str = "all"
+    """Frames of the film: all, or FIRST:LAST (LAST excluded)."""
     measurement: Path | None = None
     """Measurement sequence (.zarr) of the film (default: the one that the film names)."""
     density: Literal["auto", "improved", "film"] = "auto"
@@ -73,7 +74,7 @@ def run(settings: Velocity) -> VelocitySequence:
             settings.film,
             settings.out,
             VelocityFit(**vars(settings.fit)),
-            frames=settings.frames,
+            frames=None if settings.frames == "all" else frame_range(settings.frames),
             measurement=settings.measurement,
             density=settings.density,
             force=settings.force,
