@@ -11,6 +11,7 @@ from nerif.cli.measuring import MeasuringSettings, print_views
 from nerif.cli.output import counting_bar, say
 from nerif.cli.settings import command
 from nerif.common.conventions import InputError
+from nerif.common.files import ending
 from nerif.common.installation import quoted, word_of
 from nerif.common.interruption import if_interrupted
 from nerif.common.locks import locked
@@ -58,7 +59,7 @@ def run(settings: Vectors) -> Measurement:
     from nerif.imaging.vectors.vectors import VectorFilm
 
     out, image = settings.out, settings.out.with_suffix(".png")
-    film = out.suffix.lower() == ".zarr"
+    film = ending(out) == ".zarr"
     check_output(
         out, settings.force or film, *(() if film else (image,)), endings=(".nc", ".zarr")
     )  # a film is continued
