@@ -147,7 +147,7 @@ def test_the_remedy_adds_to_the_offsets_of_the_measurement():
 
 def test_evidence_of_shifts():
     evidence = Evidence({-1: 10.0, 0: 50.0, 1: 90.0})
-    assert (evidence.best, evidence.gain(), evidence.sharp) == (1, 40.0, False)
+    assert (evidence.best, evidence.gain, evidence.sharp) == (1, 40.0, False)
     assert Evidence({-1: 10.0, 0: 50.0}).sharp
 
 

@@ -17,7 +17,7 @@ from nerif.analysis.alignment import aligned
 from nerif.analysis.asymmetry import withhold_half
 from nerif.analysis.gains import gains_of, with_gains
 from nerif.analysis.image_edges import cut_edges
-from nerif.analysis.metrics import coverage, slice_metrics, view_metrics, volume_metrics
+from nerif.analysis.metrics import FLOW, coverage, slice_metrics, view_metrics, volume_metrics
 from nerif.analysis.prediction import check_sees, reproject
 from nerif.analysis.residuals import white_noise, whiteness
 from nerif.common.arrays import filled
@@ -41,13 +41,12 @@ from nerif.reconstruction.rig_parameters import with_corrections
 from nerif.results.directory import METRICS, VOLUME, ResultDirectory
 from nerif.results.metrics_file import Metrics, ViewScores
 
-FLOW = 0.02  # share of the largest excess, above which a voxel counts as flow
 ALIGNMENTS = ("none", "rigid")
 WINDOWS = 0.5, 5.0  # px, standard deviations of windows of optical flow
 PARALLEL_PIXELS = 8e6  # of the views that are scored at a time: about 0.1 GiB per megapixel
 
 __all__ = [
-    "FLOW", "check_inside", "evaluate", "evaluate_aligned", "evaluate_views", "evaluate_volume", "rms_with_unit",
+    "check_inside", "evaluate", "evaluate_aligned", "evaluate_views", "evaluate_volume", "rms_with_unit",
     "score_lines",
 ]  # fmt: skip
 
@@ -230,7 +229,7 @@ def evaluate_volume(
 
 
 def evaluate_aligned(field: Field, truth: Volume, n_ambient: float) -> dict[str, Any]:
-    """Compare a field with a truth after the best rigid motion; return the scores and turn_rad, shift_mm."""
+    """Compare a field with a truth after the best rigid motion; return the scores and rotation_rad, shift_mm."""
     moved = aligned(field, truth)
     scores = evaluate_volume(moved, truth, n_ambient)
     del scores["slices"]

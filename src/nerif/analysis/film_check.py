@@ -176,9 +176,10 @@ class Evidence:
         """Shift with the largest evidence."""
         return max(self.by_shift, key=lambda k: self.by_shift[k])
 
-    def gain(self, over: int = 0) -> float:
-        """Return how much larger the largest evidence is than that of another shift."""
-        return self.by_shift[self.best] - self.by_shift.get(over, 0.0)
+    @property
+    def gain(self) -> float:
+        """How much larger the largest evidence is than that for no shift."""
+        return self.by_shift[self.best] - self.by_shift[0]
 
     @property
     def stands_out(self) -> bool:
@@ -267,7 +268,7 @@ def frame_shifts(
     shifts = [0] * count
     evidences = _evidences(excerpt, instants, shifts, voxels, on_step)
     for _ in range(MAX_ROUNDS):
-        gains = [evidence.gain() for evidence in evidences]
+        gains = [evidence.gain for evidence in evidences]
         if max(gains) < (MIN_GAIN_AFTER if any(shifts) else MIN_GAIN):
             break
         trials, likely = [], [i for i in range(count) if gains[i] >= MIN_SHARE * max(gains)]

@@ -27,13 +27,12 @@ TOLERANCE = 1e-5  # change of a gain in one iteration
 MIN_GAIN = 0.01  # of the median gain: the gain of a darker view is noise
 
 
-def fit_gains(measurement: Measurement, voxels: int = COARSE_VOXELS) -> dict[str, float]:
+def fit_gains(measurement: Measurement) -> dict[str, float]:
     """Return the gain of every view by its name, with a geometric mean of 1.
 
     Parameters
     ----------
     measurement : of emission, two views or more, without withheld views
-    voxels : of the coarse field, along the longest edge
     """
     (observation, *others) = measurement.observations
     if others or not observation.technique.gains:
@@ -43,7 +42,7 @@ def fit_gains(measurement: Measurement, voxels: int = COARSE_VOXELS) -> dict[str
         raise InputError("expected two views or more, got one; gains are relative to other views", field="fit_gains")
     rays, values, _ = measurement.rays(observation)
     view, measured = rays.view.long(), values[:, 0]
-    grid, model = Grid.of_resolution(measurement.box, voxels), forward_model(observation.technique, measurement)
+    grid, model = Grid.of_resolution(measurement.box, COARSE_VOXELS), forward_model(observation.technique, measurement)
     operator = VoxelOperator(rays, grid, model)
     sensitivity = operator.T(torch.ones_like(values)).clamp_min(1e-12)
     field, gains = torch.ones(operator.domain_shape), torch.ones(len(measurement.cameras))

@@ -8,13 +8,15 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 __all__ = [
-    "LEVELS", "correlation", "coverage", "psnr", "slice_metrics", "ssim", "view_metrics", "volume_errors",
+    "FLOW", "LEVELS", "correlation", "coverage", "psnr", "slice_metrics", "ssim", "view_metrics", "volume_errors",
     "volume_metrics",
 ]  # fmt: skip
 
 Array = np.ndarray
 
+FLOW = 0.02  #: share of the largest excess above which a voxel counts as flow
 LEVELS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)  #: confidence levels of a reliability diagram
+SLICES = 10  # across z
 NAN = float("nan")
 
 
@@ -82,11 +84,11 @@ def volume_metrics(truth: Float[Array, "z y x"], test: Float[Array, "z y x"], n_
 
 
 def slice_metrics(
-    truth: Float[Array, "z y x"], test: Float[Array, "z y x"], heights: Float[Array, " z"], slices: int = 10
+    truth: Float[Array, "z y x"], test: Float[Array, "z y x"], heights: Float[Array, " z"]
 ) -> list[dict[str, float]]:
     """Return cc, ssim and psnr of equally spaced slices across z; `heights` in mm."""
     nz = truth.shape[0]
-    indices = np.unique(((np.arange(slices) + 0.5) * nz / slices).astype(int))
+    indices = np.unique(((np.arange(SLICES) + 0.5) * nz / SLICES).astype(int))
     records = []
     for i in indices:
         gt, rec, valid = truth[i], test[i], np.isfinite(truth[i])

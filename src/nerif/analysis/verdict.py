@@ -31,6 +31,7 @@ from dataclasses import dataclass
 
 from nerif.analysis.asymmetry import camera_of
 from nerif.analysis.image_edges import REMEDY
+from nerif.analysis.metrics import FLOW
 from nerif.analysis.remedies import CHECK, DEVIATIONS, SYMMETRY, WITHHOLD, advice, is_fitted, likely_cause, longer
 from nerif.common.conventions import percent
 from nerif.data.quantity_names import field_of
@@ -57,7 +58,6 @@ MIN_CAMERAS = 4
 ASYMMETRIC, NOT_SYMMETRIC = 0.25, 0.4  # antisymmetric share of the signal of a flow taken as axisymmetric
 UNEVEN = 1.35  # residual of the worst view over that of the median view, each relative to the signal
 LITTLE = 0.2  # of the time limit: a fit that had less was cut short
-FLOW = 0.02  # share of the largest value above which a voxel counts as flow
 
 ONE_CAMERA = (
     "with one camera no other view checks the calibration: lengths scale with its mm per px, and the index excess with "

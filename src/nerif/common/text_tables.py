@@ -15,7 +15,7 @@ import numpy as np
 from nerif.common.conventions import InputError
 from nerif.common.files import check_file, reading
 
-__all__ = ["TextTable", "read_numbers", "text_of"]
+__all__ = ["UNIT", "TextTable", "read_numbers", "text_of"]
 
 NUMBER = re.compile(r"[+-]?(\d+[.,]?\d*|[.,]\d+)([eEdD][+-]?\d+)?|[+-]?nan|[+-]?inf", re.IGNORECASE)
 UNIT = re.compile(r"\s*[\[(]([^\])]*)[\])]")

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from nerif.common.files import ending
 from nerif.common.netcdf import opened, values, write_dataset
 from nerif.data.quantity_names import describe
 from nerif.data.vti import write_vtp
@@ -29,7 +29,7 @@ class SurfaceMap:
 
     def write(self, path: str | os.PathLike[str]) -> None:
         """Write a file for ParaView (.vtp) or NetCDF-4 (.nc), atomically."""
-        if Path(path).suffix.lower() == ".vtp":
+        if ending(path) == ".vtp":
             write_vtp(path, self.vertices, self.faces, self.quantities, self.attributes)
             return
         import xarray as xr

@@ -38,7 +38,7 @@ def write_vti(
     origin, spacing = (" ".join(repr(float(x)) for x in numbers) for numbers in (corner, grid.spacing))
     document = _Document("ImageData", attributes, WholeExtent=extent, Origin=origin, Spacing=spacing)
     piece = ElementTree.SubElement(document.content, "Piece", Extent=extent)
-    document.add_arrays(piece, "PointData", arrays)
+    document.add_arrays(piece, arrays)
     document.write(path)
 
 
@@ -59,7 +59,7 @@ def write_vtp(
     document = _Document("PolyData", attributes)
     counts = {"NumberOfPoints": str(len(vertices)), "NumberOfPolys": str(len(faces))}
     piece = ElementTree.SubElement(document.content, "Piece", counts)
-    document.add_arrays(piece, "PointData", arrays)
+    document.add_arrays(piece, arrays)
     points = ElementTree.SubElement(piece, "Points")
     document.add(points, "DataArray", "Float64", "Points", _bytes(vertices, "<f8"), NumberOfComponents="3")
     polygons = ElementTree.SubElement(piece, "Polys")
@@ -115,9 +115,11 @@ class _Document:
         )
         self.appended.append(_compress(content))
 
-    def add_arrays(self, piece: ElementTree.Element, tag: str, arrays: dict[str, Tensor]) -> None:
+    def add_arrays(self, piece: ElementTree.Element, arrays: dict[str, Tensor]) -> None:
         """Add an element with arrays of points, the first of which is shown."""
-        points = ElementTree.SubElement(piece, tag, Scalars=next(name for name, a in arrays.items() if a.ndim < 4))
+        points = ElementTree.SubElement(
+            piece, "PointData", Scalars=next(name for name, a in arrays.items() if a.ndim < 4)
+        )
         for name, values in arrays.items():
             size, more = values.element_size(), {}
             if values.ndim == 4:

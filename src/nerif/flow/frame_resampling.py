@@ -16,7 +16,8 @@ __all__ = [
     "squared_slope",
 ]  # fmt: skip
 
-NARROWEST = 1.2  # standard deviation of an average, voxels: finer waves of a density are below the resolution of a film
+WIDTH = 0.6  # standard deviation of an average, coarse voxels
+NARROWEST = 1.2  # the least, fine voxels: finer waves of a density are below the resolution of a film
 
 
 def along_axes(values: Float[Tensor, "*c z y x"], matrices: Sequence[Tensor]) -> Float[Tensor, "*c z2 y2 x2"]:
@@ -26,10 +27,10 @@ def along_axes(values: Float[Tensor, "*c z y x"], matrices: Sequence[Tensor]) ->
     return values
 
 
-def averages(fine: Grid, coarse: Grid, width: float = 0.6) -> list[Tensor]:
-    """Return the matrices of Gaussian averages about coarse voxels, `width` of which is the standard deviation."""
+def averages(fine: Grid, coarse: Grid) -> list[Tensor]:
+    """Return the matrices of Gaussian averages about coarse voxels."""
     pairs = zip(fine.shape, coarse.shape, strict=True)
-    return [_gaussian(n, m, max(NARROWEST, width * n / m)) for n, m in pairs]
+    return [_gaussian(n, m, max(NARROWEST, WIDTH * n / m)) for n, m in pairs]
 
 
 def interpolations(coarse: Grid, fine: Grid, shape: Sequence[int], first: Sequence[int]) -> list[Tensor]:

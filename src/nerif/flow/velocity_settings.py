@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from annotated_types import Ge, Gt, Lt
 
-from nerif.common.settings import Checked, Count, Positive
+from nerif.common.settings import Checked, Count, Natural, NonNegative, Positive
 
 __all__ = ["MIN_VOXELS", "PHYSICS", "VelocitySettings"]
 
@@ -30,7 +30,7 @@ class VelocitySettings(Checked):
     """Acceleration of gravity along x, y, z, mm/s^2."""
     resolution: Annotated[int, Ge(MIN_VOXELS)] = 30
     """Voxels of the velocity along the longest edge of the box."""
-    time_limit: Annotated[float, Ge(0)] = 600.0
+    time_limit: NonNegative = 600.0
     """Limit on the duration, s (0: none)."""
     max_iterations: Count = 300
     """Iterations of each stage at most."""
@@ -40,7 +40,7 @@ class VelocitySettings(Checked):
     """Change of vorticity per interval that the equations do not explain, relative to its largest value."""
     correlation: Positive = 20.0
     """Wavelength below which the vorticity is expected to be smaller, mm."""
-    samples: Annotated[int, Ge(0)] = 6
+    samples: Natural = 6
     """Samples of the flow, from which standard deviations are computed (0: none)."""
     sample_iterations: Count = 40
     """Iterations of each sample."""

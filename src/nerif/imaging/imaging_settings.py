@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from annotated_types import Ge, Lt
 
 from nerif.common.conventions import AMBIENT_INDEX, DEFAULT_AMBIENT_FACES
-from nerif.common.settings import Checked, NonNegative, Positive
+from nerif.common.settings import Checked, Natural, NonNegative, Positive
 
 __all__ = ["DisplacementSettings", "MaskSettings", "Surroundings"]
 
@@ -25,9 +25,9 @@ class DisplacementSettings(Checked):
     ilk, tvl1."""
     smoothness: Positive = 1.0
     """Above 1 for smoother displacements; scales window or regularisation (fixed for deepflow)."""
-    local_contrast: Annotated[int, Ge(0)] = 0
+    local_contrast: Natural = 0
     """Window (px) over which brightness and contrast are equalised; 0 matches them over the whole image only."""
-    shake_border: Annotated[int, Ge(0)] = 0
+    shake_border: Natural = 0
     """Width (px) of the flow-free border to which shift, rotation and zoom are fitted and removed; 0 for none."""
     max_sigma: Positive = 0.5
     """Pixels with more noise than this are not valid, px."""
@@ -48,9 +48,9 @@ class MaskSettings(Checked):
     """Flow is where the measured quantity (of displacements |d|) exceeds this multiple of sigma."""
     smooth: NonNegative = 1.5
     """Standard deviation of a Gaussian over the values / sigma before the threshold, px."""
-    smallest: Annotated[int, Ge(0)] = 64
+    smallest: Natural = 64
     """Islands and holes of fewer pixels are removed."""
-    grow: Annotated[int, Ge(0)] = 3
+    grow: Natural = 3
     """Pixels added all around, so that the mask includes the edge of the flow."""
 
 

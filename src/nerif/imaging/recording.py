@@ -7,15 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
-from annotated_types import Ge
 from jaxtyping import Bool
 
 from nerif.common.conventions import InputError
-from nerif.common.settings import check_settings
+from nerif.common.settings import Natural, check_settings
 from nerif.data.cameras_file import CalibratedCamera
 from nerif.data.measurement import Measurement
 from nerif.geometry import Box, Camera
@@ -119,7 +118,7 @@ class Recording:
     scene: Scene
     method: DisplacementSettings = field(default_factory=DisplacementSettings)  #: of the displacements
     masks: MaskSettings | None = None  #: of the flow, or None; drawn masks take precedence
-    references: Annotated[int, Ge(0)] = 100  #: most reference images to use; 0 for all
+    references: Natural = 100  #: most reference images to use; 0 for all
     images: bool = True  #: whether a measurement of one flow image includes the images
 
     def __post_init__(self) -> None:

@@ -32,7 +32,7 @@ from nerif.data.measurement import Measurement
 from nerif.geometry import Camera, Grid, Rays
 from nerif.geometry.body import Body
 from nerif.geometry.pose import rotation_matrix
-from nerif.imaging.masks import read_mask
+from nerif.imaging.readers.open import read_mask
 
 __all__ = ["BodyPose", "drawn_silhouettes", "hull_of_silhouettes", "outline", "refine_pose"]
 

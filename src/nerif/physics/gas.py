@@ -179,7 +179,7 @@ class GasSettings(Medium):
         low, high = np.quantile(values, [EXTREME, 1 - EXTREME]).clip((-math.inf, 0.0), (0.0, math.inf))
         of_flow = (np.quantile(values[values >= FLOW * high], 1 - QUARTER),
                    np.quantile(values[values <= FLOW * low], QUARTER))  # fmt: skip
-        density = density_from_index(np.array(of_flow), n_ambient, gladstone_dale(self.composition, self.wavelength_nm))
+        density = density_from_index(np.array(of_flow), n_ambient, self._constant)
         cold, hot = temperature_from_density(density, self.pressure_pa, molar_mass(self.composition))
         return -float(low), float(high), float(cold), math.inf if math.isnan(hot) else float(hot)
 

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from nerif.geometry import Grid
 
 __all__ = [
-    "COLOURS", "COLOUR_MAPS", "DIVERGING", "LABELS", "SEQUENTIAL", "Drawable", "add_colour_bar", "colour_range",
-    "draw_map", "draw_slice", "draw_slices", "label_of", "map_colours", "map_range", "plain", "plotted_quantities",
+    "COLOURS", "DIVERGING", "LABELS", "Drawable", "add_colour_bar", "colour_range", "colours_of", "draw_map",
+    "draw_slice", "draw_slices", "label_of", "map_colours", "map_range", "plain", "plotted_quantities",
     "plotted_values", "style",
 ]  # fmt: skip
 
@@ -108,6 +108,11 @@ def label_of(quantity: str) -> str:
     return f"{name} [{unit}]"
 
 
+def colours_of(quantity: str) -> str:
+    """Return the colour map of a quantity, or of statistics of it."""
+    return COLOUR_MAPS.get(quantity.partition("_")[0], SEQUENTIAL)
+
+
 def plotted_values(volume: Drawable) -> np.ndarray:
     """Return the values to plot, (z, y, x): n - 1 for n."""
     values = volume.values.double().numpy()
@@ -128,7 +133,7 @@ def draw_slice(
     axes.set_facecolor("0.8")
     axes.imshow(
         plane, origin="lower", extent=(box.lower[i], box.upper[i], box.lower[j], box.upper[j]), vmin=low, vmax=high,
-        cmap=colour_map or COLOUR_MAPS.get(volume.quantity.partition("_")[0], SEQUENTIAL), interpolation="nearest",
+        cmap=colour_map or colours_of(volume.quantity), interpolation="nearest",
     )  # fmt: skip
     axes.set(xlabel=f"{across} [mm]", ylabel=f"{up} [mm]")
     return axes

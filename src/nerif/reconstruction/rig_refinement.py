@@ -369,13 +369,11 @@ def load_rig(rig: Refinement | None, tensors: Mapping[str, Tensor]) -> None:
 
 @torch.no_grad()
 def refit(
-    field: Field, measurement: Measurement, settings: Mapping[str, Any], device: torch.device | str = "cpu",
-    steps: int = REFIT_STEPS, per_view: int = REFIT_PIXELS,
+    field: Field, measurement: Measurement, settings: Mapping[str, Any], device: torch.device | str = "cpu"
 ) -> list[RefinedView]:  # fmt: skip
     """Return the table of the refined parameters of views, such as withheld ones, against a fixed field.
 
-    It is empty for images without displacements, whose brightness is unknown. Each of the Gauss-Newton steps uses
-    `per_view` pixels per view.
+    It is empty for images without displacements, whose brightness is unknown.
     """
     measurement = of_source(measurement, "auto", preferred="displacements")
     if "images" in measurement.maps:
@@ -386,8 +384,8 @@ def refit(
     def predict(part: TechniqueData, rays: Rays) -> Tensor:
         return project(PathIntegral(part.model, REFIT_SAMPLES), field, rays, device)
 
-    for i in range(steps):
-        pixels = random_pixels(target, len(measurement.names), i, per_view)
+    for i in range(REFIT_STEPS):
+        pixels = random_pixels(target, len(measurement.names), i, REFIT_PIXELS)
         rig.step(pixels, predict, target.sigma_known, momentum=0.0)
     return rig.table()
 

@@ -9,14 +9,14 @@ import numpy as np
 
 from nerif.common.files import atomic
 from nerif.imaging.calibration.result import Calibration
-from nerif.plotting.drawing import plain
+from nerif.plotting.drawing import COLOURS, plain
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 __all__ = ["draw_errors", "draw_residuals", "save_errors"]
 
-FREE, ON_BACKGROUND, REJECTED = "#0072B2", "#56B4E9", "#D55E00"
+FREE, ON_BACKGROUND, REJECTED = COLOURS["blue"], "#56B4E9", COLOURS["orange"]
 
 
 def draw_errors(axes: Axes, calibration: Calibration) -> Axes:

@@ -11,6 +11,7 @@ import torch
 
 from nerif.common.files import atomic
 from nerif.geometry import Ring
+from nerif.plotting.drawing import COLOURS
 from nerif.simulation.rig_design import DesignSettings, expect
 
 if TYPE_CHECKING:
@@ -30,10 +31,10 @@ def draw_plan(axes: Axes, ring: Ring, flow: DesignSettings) -> Axes:
         ends = torch.tensor([[0.0, (height - 1) / 2], [width - 1.0, (height - 1) / 2]], dtype=torch.float64)
         rays = camera.rays(ends)
         lens, edges = rays.origin[:, :2].numpy(), rays.end_points[:, :2].numpy()
-        axes.fill(*np.concatenate([lens, edges[::-1]]).T, color="#0072B2", alpha=0.08, linewidth=0)
+        axes.fill(*np.concatenate([lens, edges[::-1]]).T, color=COLOURS["blue"], alpha=0.08, linewidth=0)
         axes.plot(*edges.T, color="black", linewidth=2)
-        axes.plot(*lens.T, marker="o", color="#0072B2", markersize=5)
-    axes.add_patch(Circle((0, 0), flow.flow_size / 2, color="#D55E00", alpha=0.7))
+        axes.plot(*lens.T, marker="o", color=COLOURS["blue"], markersize=5)
+    axes.add_patch(Circle((0, 0), flow.flow_size / 2, color=COLOURS["orange"], alpha=0.7))
     axes.set(aspect="equal", xlabel="x [mm]", ylabel="y [mm]")
     axes.set_title("plan view: cameras, backgrounds, flow", fontsize=9)
     return axes
@@ -43,8 +44,9 @@ def draw_displacement(axes: Axes, ring: Ring, flow: DesignSettings) -> Axes:
     """Draw the expected displacement (px) and the resolution (mm) over the background distance."""
     distances = ring.background_distance * np.geomspace(0.2, 3, 60)
     expected = [expect(replace(ring, background_distance=float(d)), flow) for d in distances]
-    axes.plot(distances, [e.displacement for e in expected], color="#0072B2", label="displacement [px]")
-    axes.plot(distances, [e.resolution for e in expected], color="#D55E00", linestyle="--", label="resolution [mm]")
+    displacements, resolutions = [e.displacement for e in expected], [e.resolution for e in expected]
+    axes.plot(distances, displacements, color=COLOURS["blue"], label="displacement [px]")
+    axes.plot(distances, resolutions, color=COLOURS["orange"], linestyle="--", label="resolution [mm]")
     axes.axhline(flow.displacement_noise, color="0.5", linewidth=0.8)
     axes.text(distances[-1], flow.displacement_noise, "noise [px]", fontsize=7, ha="right", va="bottom", color="0.4")
     axes.axvline(ring.background_distance, color="0.7", linewidth=0.8, linestyle=":")

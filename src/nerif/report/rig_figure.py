@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from mpl_toolkits.mplot3d import Axes3D
 
-__all__ = ["ImageCorners", "draw_rig", "draw_two_sides", "image_corners", "save_rig"]
+__all__ = ["ImageCorners", "box_edges", "draw_rig", "draw_two_sides", "image_corners", "save_rig"]
 
 COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00")  # Okabe & Ito
 
@@ -58,10 +58,8 @@ def draw_rig(axes: Axes3D, cameras: Sequence[Camera], box: Box | None = None) ->
         axes.text(*name_at, plain(camera.name), color=colour, fontsize=6.5, ha="center", va="center")
         points += [name_at[None], corner.start, corner.end]
     if box is not None:
-        vertices = np.array(list(itertools.product(*zip(box.lower, box.upper, strict=True))))
-        for a, b in itertools.combinations(vertices, 2):
-            if np.count_nonzero(a != b) == 1:
-                axes.plot(*np.stack([a, b]).T, color="black", linewidth=1)
+        for ends in box_edges(box):
+            axes.plot(*ends.T, color="black", linewidth=1)
     for axis, (name, colour) in enumerate(zip("xyz", ("red", "green", "blue"), strict=True)):
         end = np.zeros(3)
         end[axis] = 0.3 * extent
@@ -140,6 +138,12 @@ def image_corners(camera: Camera, target: Float[np.ndarray, 3]) -> ImageCorners:
     if camera.interfaces and camera.projection.shows_depth:  # not where the ray begins, on the last interface
         start = np.broadcast_to(camera.centre.double().numpy(), start.shape)
     return ImageCorners(start, direction, origin + last * direction)
+
+
+def box_edges(box: Box) -> Float[np.ndarray, "edge end 3"]:
+    """Return both ends of each edge of a box, mm."""
+    corners = np.array(list(itertools.product(*zip(box.lower, box.upper, strict=True))))
+    return np.array([(a, b) for a, b in itertools.combinations(corners, 2) if np.count_nonzero(a != b) == 1])
 
 
 def _closed(axes: Axes3D, corners: np.ndarray, **style: object) -> None:

@@ -17,11 +17,10 @@ from nerif.physics.gas import GasSettings
 from nerif.physics.media import stored_medium
 from nerif.physics.medium import Medium, derive
 from nerif.plotting.drawing import (
-    COLOUR_MAPS,
     DIVERGING,
     LABELS,
-    SEQUENTIAL,
     colour_range,
+    colours_of,
     plotted_quantities,
     plotted_values,
 )
@@ -124,7 +123,7 @@ def _quantity(
         "label": label,
         "unit": unit_shown(unit),
         "relation": relation,
-        "colours": COLOUR_MAPS.get(name, SEQUENTIAL),
+        "colours": colours_of(name),
         "level": level,
     }
 

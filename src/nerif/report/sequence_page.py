@@ -14,7 +14,7 @@ from nerif.common.conventions import InputError, with_unit
 from nerif.data.quantity_names import field_of
 from nerif.data.volume_sequence import StoredViewScores, VolumeSequence
 from nerif.forward.registry import technique, technique_of
-from nerif.plotting.drawing import plain
+from nerif.plotting.drawing import COLOURS, plain
 from nerif.plotting.notebook import number
 from nerif.report.html import flat, render_page, svg
 from nerif.report.scene import scene_over_time
@@ -130,7 +130,7 @@ def _curves(store: VolumeSequence, frames: list[int]) -> list[tuple[str, str]]:
         axes.legend(fontsize=7, ncols=2)
 
     def draw_seconds(axes: Axes) -> None:
-        axes.plot(times, seconds, ".", color="#0072B2")
+        axes.plot(times, seconds, ".", color=COLOURS["blue"])
         axes.set(xlabel="time [ms]", ylabel="computing time [s]")
         axes.set_ylim(bottom=0)
 

@@ -6,15 +6,10 @@ import numpy as np
 
 from nerif.data.volume import Volume
 from nerif.geometry import Box
-from nerif.plotting.drawing import COLOUR_MAPS, PLANES, SEQUENTIAL
+from nerif.plotting.drawing import PLANES
 from nerif.report.view_images import image_address
 
-__all__ = ["bar_image", "colours_of", "slice_aspect", "slice_axes", "slice_image"]
-
-
-def colours_of(quantity: str) -> str:
-    """Return the colour map of a quantity."""
-    return COLOUR_MAPS.get(quantity.partition("_")[0], SEQUENTIAL)
+__all__ = ["bar_image", "slice_aspect", "slice_axes", "slice_image"]
 
 
 def slice_image(volume: Volume, normal: str, index: int, limits: tuple[float, float], colours: str) -> str:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from nerif.data.surface import SurfaceMap
-from nerif.plotting.drawing import COLOUR_MAPS, SEQUENTIAL, colour_range, label_of
+from nerif.plotting.drawing import colour_range, colours_of, label_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -29,7 +29,7 @@ def draw_surface(figure: Figure, surface: SurfaceMap, quantity: str) -> None:
 
     corners = surface.vertices[surface.faces].numpy()
     values = surface.quantities[quantity][surface.faces].mean(dim=1).numpy()
-    colour_map = colormaps[COLOUR_MAPS.get(quantity, SEQUENTIAL)].with_extremes(bad=UNKNOWN)
+    colour_map = colormaps[colours_of(quantity)].with_extremes(bad=UNKNOWN)
     scale = ScalarMappable(Normalize(*colour_range(values)), colour_map)
     colours = scale.to_rgba(np.ma.masked_invalid(values))
     lower, upper = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))

@@ -17,7 +17,7 @@ from nerif.data.quantity_names import field_of
 from nerif.data.velocity_sequence import VelocitySequence
 from nerif.data.volume import Volume
 from nerif.data.volume_sequence import VolumeSequence
-from nerif.plotting.drawing import COLOUR_MAPS, LABELS, SEQUENTIAL, colour_range, plotted_values
+from nerif.plotting.drawing import LABELS, colour_range, colours_of, plotted_values
 from nerif.report.isosurface import default_level
 from nerif.report.movie_settings import MovieSettings
 
@@ -75,7 +75,7 @@ class Movie(MovieSettings):
                     mesh = _arrows(grid, vectors) if self.style == "arrows" else _streamlines(grid, vectors)
                 if sliced or mesh.n_points:
                     plotter.add_mesh(
-                        mesh, scalars=name, clim=limits, cmap=COLOUR_MAPS.get(volume.quantity, SEQUENTIAL),
+                        mesh, scalars=name, clim=limits, cmap=colours_of(volume.quantity),
                         scalar_bar_args=bar, lighting=False, nan_color=GREY,
                     )  # fmt: skip
             else:

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
-from annotated_types import Ge
-
-from nerif.common.settings import NonNegative
+from nerif.common.settings import Natural, NonNegative
 from nerif.physics.media import MediumSettings
 
 __all__ = ["AUTO", "NONE", "Run", "RunSettings"]
@@ -42,7 +40,7 @@ class RunSettings(MediumSettings):
     """Write report.html at the end."""
     checkpoint_every: float = 60.0
     """Interval between checkpoints in seconds."""
-    threads: Annotated[int, Ge(0)] = 0
+    threads: Natural = 0
     """Threads on a CPU (0: as many as there are free cores). With a fixed number, runs without a time limit have the
     same result to the last digit."""
 

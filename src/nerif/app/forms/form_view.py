@@ -10,6 +10,7 @@ from typing import Any, Generic, TypeVar
 
 from nicegui import ui
 
+from nerif.app.forms.elements import html
 from nerif.app.forms.form import Form, default_of, label_of, unit_of
 from nerif.app.forms.sliders import SliderScale
 from nerif.common.conventions import InputError
@@ -111,9 +112,9 @@ class FormView(Generic[T]):
             self._controls[field.name] = control
             if field.name in self.sliders:
                 self._slider(field, control, f"{label}, slider")
-            self._messages[field.name] = ui.html("", sanitize=False).classes("error")
+            self._messages[field.name] = html().classes("error")
             if field.help:
-                ui.html(f"<p>{escape(field.help)}</p>", sanitize=False).classes("help")
+                html(f"<p>{escape(field.help)}</p>").classes("help")
 
     def _slider(self, field: Option, control: Any, label: str) -> None:
         """Add a slider of the browser, which has keys and screen reader support."""
@@ -144,12 +145,10 @@ class FormView(Generic[T]):
         if field.kind == "switch":
             return ui.switch(label, value=bool(value))
         if field.kind == "choice":
-            choice = ui.select(list(field.choices), label=label, value=value, clearable=field.optional)
-            return choice.props("outlined dense options-dense")
+            return ui.select(list(field.choices), label=label, value=value, clearable=field.optional)
         if field.kind in ("number", "integer"):
-            control = ui.number(label, value=value, suffix=unit)
-            return control.props('outlined dense debounce=150 step="any"')
-        return ui.input(label, value=value, suffix=unit).props("outlined dense debounce=250")
+            return ui.number(label, value=value, suffix=unit).props('debounce=150 step="any"')
+        return ui.input(label, value=value, suffix=unit)
 
     def _set_value(self, field: Option, value: Any) -> None:
         if self.values.get(field.name, default_of(field)) == value:

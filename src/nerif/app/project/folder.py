@@ -15,7 +15,7 @@ from nerif.common.conventions import InputError
 from nerif.common.files import ending
 from nerif.common.installation import word_of
 from nerif.data.body_file import FORMATS
-from nerif.data.kinds import VOLUME, are_vectors, kind_of
+from nerif.data.kinds import CALIBRATION, VOLUME, are_vectors, kind_of
 from nerif.imaging.readers.views import View, find_views
 from nerif.results.directory import LIVE, RUN, check_links
 
@@ -156,7 +156,7 @@ class ProjectFolder:
         if ending(path) in FORMATS:
             return "models"
         if ending(path) == ".toml":
-            return "calibrations" if self.from_cache(self.relative(path), "kind", _is_calibration) else ""
+            return "calibrations" if self.from_cache(self.relative(path), "kind", kind_of) is CALIBRATION else ""
         named = ending(path) == ".nc" and path.name != "reprojection.nc"
         return "measurements" if named and self.from_cache(self.relative(path), "kind", kind_of) is not VOLUME else ""
 
@@ -170,8 +170,3 @@ def _has_views(path: Path) -> bool:
         return bool(find_views(path))
     except InputError:
         return False
-
-
-def _is_calibration(path: Path) -> bool:
-    with path.open("rb") as file:
-        return b"nerif-calibration" in file.read(4096)

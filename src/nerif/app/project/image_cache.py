@@ -46,15 +46,15 @@ class ImageCache:
         """Return the quality of the images of a source; InputError if none can be used."""
         return self._from_cache(view, source, ("quality",), lambda: image_quality(view, source, SAMPLE))
 
-    def image(self, view: View, source: str, number: int, largest: int, crop: Crop | None, white: float = 0.0) -> str:
+    def image(self, view: View, source: str, number: int, largest: int, crop: Crop | None) -> str:
         """Return a frame as the address of an image, cropped by `crop`."""
 
         def read() -> str:
             frames = view.open(source)
             image = frames[number]
-            return jpeg_address(crop(image, frames.name(number)) if crop else image, largest, white)
+            return jpeg_address(crop(image, frames.name(number)) if crop else image, largest)
 
-        return self._from_cache(view, source, ("image", number, largest, crop, white), read)
+        return self._from_cache(view, source, ("image", number, largest, crop), read)
 
     def detection(self, view: View, source: str, number: int, target: CalibrationTarget) -> Detection | None:
         """Return the corners of a target in an image; None if it is not detected."""

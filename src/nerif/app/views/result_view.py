@@ -22,8 +22,7 @@ from nerif.common.conventions import InputError, unit_shown
 from nerif.common.files import ending
 from nerif.data.quantity_names import describe
 from nerif.data.volume import Volume
-from nerif.plotting.drawing import DIVERGING, LABELS, map_range
-from nerif.report.slice_images import colours_of
+from nerif.plotting.drawing import DIVERGING, LABELS, colours_of, map_range
 from nerif.results.directory import SURFACE, VOLUME
 
 __all__ = ["ResultView"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -14,7 +13,7 @@ from nerif.common.conventions import InputError
 from nerif.geometry import Box, Camera
 from nerif.imaging.calibration.importers.importers import import_box, import_cameras
 from nerif.imaging.calibration.result import ImageError, read_errors, rms_of
-from nerif.report.rig_figure import COLOURS, image_corners
+from nerif.report.rig_figure import COLOURS, box_edges, image_corners
 
 __all__ = ["Rig", "read_rig", "show_rig"]
 
@@ -83,10 +82,8 @@ def show_rig(rig: Rig) -> None:
             style = f"color: #16202b; background: {GROUND}; font: 600 13px system-ui; border-bottom: 3px solid {colour}"
             scene.text(one.name, style=style).move(*at(place))
         if rig.box is not None:
-            ends = np.array(list(itertools.product(*zip(rig.box.lower, rig.box.upper, strict=True))))
-            for a, b in itertools.combinations(ends, 2):
-                if np.count_nonzero(a != b) == 1:
-                    line(a, b, "#16202b")
+            for a, b in box_edges(rig.box):
+                line(a, b, "#16202b")
         for axis, colour in enumerate(("#c62828", "#2e7d32", "#1565c0")):
             end = 0.1 * reach * np.eye(3)[axis]
             line(np.zeros(3), end, colour)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
@@ -18,6 +17,7 @@ from nerif.common.conventions import unit_shown
 from nerif.data.quantity_names import describe, name_of
 from nerif.geometry import Box
 from nerif.report.isosurface import default_level, surface_triangles
+from nerif.report.rig_figure import box_edges
 from nerif.results.live import LiveSnapshot
 
 __all__ = ["LiveSurface", "Surface", "SurfaceView", "caption_of", "scene_of"]
@@ -73,11 +73,10 @@ class BoxScene:
             return surface.move(*(-c * self._scale for c in self.box.centre))
 
     def _edges(self) -> None:
-        ends = np.array(list(itertools.product((-0.5, 0.5), repeat=3))) * self.box.edges * self._scale
+        ends = (box_edges(self.box) - self.box.centre) * self._scale
         with self.scene:
-            for a, b in itertools.combinations(ends, 2):
-                if np.count_nonzero(a != b) == 1:
-                    self.scene.line(a.tolist(), b.tolist()).material(EDGE)
+            for a, b in ends.tolist():
+                self.scene.line(a, b).material(EDGE)
 
 
 @dataclass(frozen=True)

@@ -7,14 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from annotated_types import Ge
-
 from nerif.cli.arguments import check_output
 from nerif.cli.output import counting_bar, say
 from nerif.cli.settings import Settings, command
 from nerif.common.conventions import InputError
 from nerif.common.locks import locked
-from nerif.common.settings import Positional
+from nerif.common.settings import Natural, Positional
 
 if TYPE_CHECKING:
     from nerif.data.measurement import Measurement
@@ -52,7 +50,7 @@ class BodyInFlow(Settings):
     poses: Path | None = None
     """Poses of models that move in a film: a table (.csv) with the columns rx, ry, rz (degrees), tx, ty, tz (mm) and a
     row per frame."""
-    margin: Annotated[int, Ge(0)] = 0
+    margin: Natural = 0
     """Pixels around those that see a body, without data either: half the correlation window, where it mixes the two."""
     remove: bool = False
     """Remove the bodies; pixels that saw one stay without data."""

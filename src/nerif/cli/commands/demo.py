@@ -9,13 +9,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from annotated_types import Ge
-
 from nerif.cli.output import say
 from nerif.cli.settings import Settings, command
 from nerif.common.conventions import InputError
 from nerif.common.installation import command_line, install
-from nerif.common.settings import Positional
+from nerif.common.settings import Natural, Positional
 from nerif.common.written_files import OwnFiles
 from nerif.data.samples import SAMPLES, sample
 
@@ -102,7 +100,7 @@ class Demo(Settings):
     """Name of the demo; --list describes them."""
     out: Path | None = None
     """Directory to write (default: out/NAME)."""
-    steps: Annotated[int, Ge(0)] = 0
+    steps: Natural = 0
     """Training steps (0: as many as the demo needs)."""
     list: bool = False
     """List the demos, and end."""

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from annotated_types import Ge
-
 from nerif.cli.arguments import check_output
+from nerif.cli.measuring import MeasuringSettings, print_views
 from nerif.cli.output import counting_bar, say
-from nerif.cli.settings import Settings, command
+from nerif.cli.settings import command
 from nerif.common.conventions import InputError
 from nerif.common.interruption import if_interrupted
 from nerif.common.locks import locked
-from nerif.common.settings import Count, Flat, NonNegative, Positional
+from nerif.common.settings import Count, Flat, Natural, NonNegative, Positional
 from nerif.imaging.imaging_settings import DisplacementSettings, MaskSettings, Surroundings
 
 if TYPE_CHECKING:
@@ -23,13 +21,13 @@ if TYPE_CHECKING:
     from nerif.data.measurement_sequence import MeasurementSequence
     from nerif.imaging.recording import Recording
 
-__all__ = ["Displacement", "main", "print_views", "run"]
+__all__ = ["Displacement", "main", "run"]
 
 UNRECORDED = ("out", "force", "config", "frames", "frame_offset")  # or recorded by measure_recording
 
 
 @dataclass(frozen=True)
-class Displacement(Settings):
+class Displacement(MeasuringSettings):
     """Compute the displacements of all views, and write them with the calibration as a measurement.
 
     Displacement: where a dot appears with flow minus where it appears without (px, u right, v down).
@@ -41,17 +39,9 @@ class Displacement(Settings):
 
     folder: Annotated[Path, Positional]
     """Folder of the experiment."""
-    calibration: Path
-    """Calibrated cameras with the names of the views: output of nerif calibrate, or any file that it imports."""
     out: Path
     """Measurement to write, NAME.nc, with a figure NAME.png; with --frames NAME.zarr."""
-    lower: tuple[float, float, float] | None = None
-    """Lower corner x y z of the box to reconstruct, mm (default: box of the calibration)."""
-    upper: tuple[float, float, float] | None = None
-    """Upper corner x y z of the box, mm."""
-    views: tuple[str, ...] = ()
-    """Views to use (default: all)."""
-    frame: Annotated[int, Ge(0)] = 0
+    frame: Natural = 0
     """Number of the flow image."""
     frames: str = ""
     """Flow images of a sequence: all, or FIRST:LAST (LAST excluded); requires --out NAME.zarr."""
@@ -62,7 +52,7 @@ class Displacement(Settings):
     """Flow images per second (0: from the recording)."""
     average: Count = 1
     """Number of flow images, from --frame on, whose displacements are averaged."""
-    references: Annotated[int, Ge(0)] = 100
+    references: Natural = 100
     """Maximum number of reference images (0: all)."""
     mask: NonNegative = 0.0
     """Threshold of the flow mask for the visual hull: |d| in units of sigma, such as 4 (0: no mask)."""
@@ -76,7 +66,7 @@ class Displacement(Settings):
     def recording(self) -> Recording:
         """Return images, cameras and box."""
         from nerif.geometry import Box
-        from nerif.imaging.calibration.importers.importers import import_box, import_cameras
+        from nerif.imaging.calibration.importers.importers import box_to_reconstruct, import_cameras
         from nerif.imaging.calibration.importers.names import cameras_by_view
         from nerif.imaging.readers.views import find_views
         from nerif.imaging.recording import Recording, Scene
@@ -84,13 +74,7 @@ class Displacement(Settings):
         views = find_views(self.folder, self.views, self.frame_offset)
         everything = [view.name for view in find_views(self.folder)]
         cameras = cameras_by_view(everything, import_cameras(self.calibration), say)
-        box = Box.between(self.lower, self.upper) or import_box(self.calibration)
-        if box is None:
-            raise InputError(
-                f"expected the corners of the box to reconstruct, since {self.calibration} has none; "
-                "give --lower X Y Z and --upper X Y Z, mm",
-                field="lower, upper",
-            )
+        box = box_to_reconstruct(Box.between(self.lower, self.upper), self.calibration)
         scene = Scene(box, self.surroundings)
         masks = MaskSettings(self.mask) if self.mask else None
         return Recording(views, cameras, scene, self.method, masks, self.references, self.images)
@@ -135,23 +119,6 @@ def _run_over_time(settings: Displacement, recording: Recording) -> MeasurementS
     out = settings.out
     with locked(out), if_interrupted(lambda: remedy), counting_bar("references, then frames", count) as bar:
         return measure_recording(recording, numbers, times, out, attributes, settings.force, say, bar)
-
-
-def print_views(measurement: Measurement, noise: Mapping[str, str]) -> None:
-    from nerif.data.measurement_summary import valid_pixels
-    from nerif.forward.deflection import Deflection
-
-    say(f"{'view':<12}{'valid':>8}{'rms d [px]':>12}{'max |d| [px]':>14}{'sigma [px]':>12}  noise from")
-    assert measurement.sigma is not None
-    (deflection,) = (o for o in measurement.observations if o.technique is Deflection)
-    usable = measurement.usable_for(deflection)
-    for i, (name, share) in enumerate(zip(measurement.names, measurement.valid_share(deflection), strict=True)):
-        d, sigma = measurement.displacements[i][usable[i]], measurement.sigma[i][usable[i]]
-        say(
-            f"{name:<12}{share:>8.1%}{float(d.square().mean().sqrt()):>12.3f}"
-            f"{float(d.norm(dim=-1).max()):>14.3f}{float(sigma.median()):>12.4f}  {noise[name]}"
-        )
-    say(f"valid pixels: {valid_pixels(measurement)}")
 
 
 main = command("displacement", Displacement, run)

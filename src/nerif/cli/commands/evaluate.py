@@ -54,7 +54,7 @@ def run(settings: Evaluate) -> dict[str, Any]:
 
 
 def _print_volume(metrics: dict[str, Any]) -> None:
-    from nerif.analysis.evaluation import FLOW
+    from nerif.analysis.metrics import FLOW
 
     if "coverage" in metrics:
         coverage = metrics["coverage"]

@@ -29,15 +29,12 @@ class Report(Settings):
 
 def run(settings: Report) -> Path:
     """Write the report, and print what it lacks."""
-    from nerif.results.directory import REPORT
     from nerif.workflow.reports import write_report, write_sequence_report
 
-    is_store = ending(settings.result) == ".zarr"
-    out = settings.out or (settings.result.with_suffix(".html") if is_store else settings.result / REPORT)
     if settings.out is not None:
-        check_output(out, settings.force, endings=(".html", ".htm"))
-    write = write_sequence_report if is_store else write_report
-    return write(settings.result, out, MONITOR)
+        check_output(settings.out, settings.force, endings=(".html", ".htm"))
+    write = write_sequence_report if ending(settings.result) == ".zarr" else write_report
+    return write(settings.result, settings.out, MONITOR)
 
 
 main = command("report", Report, run)

@@ -6,13 +6,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
-from annotated_types import Ge
-
 from nerif.cli.commands import velocity
 from nerif.cli.commands.reconstruct import read_with_preset
 from nerif.cli.output import MONITOR, figures_bar
 from nerif.cli.settings import Settings, compute
-from nerif.common.settings import MISSING, Flat, Positional
+from nerif.common.settings import MISSING, Flat, Natural, Positional
 from nerif.flow.velocity_settings import VelocitySettings
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.neural.presets import PRESETS
@@ -41,9 +39,9 @@ class Sequence(Settings):
     cluster: str = "local"
     """Where to compute: local, tcp://HOST:PORT of a Dask scheduler, or a YAML file for SLURM (docs/sequences.md); not
     from a settings file, since the latter two can run code here."""
-    workers: Annotated[int, Ge(0)] = 0
+    workers: Natural = 0
     """Workers of a local cluster (0: one per GPU, or per two cores)."""
-    threads: Annotated[int, Ge(0)] = 0
+    threads: Natural = 0
     """Threads of each worker on a CPU (0: its share of the cores)."""
     dashboard: bool = False
     """Serve the Dask dashboard on 127.0.0.1, visible to all users of this machine."""

@@ -6,17 +6,16 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from annotated_types import Ge
-
 from nerif.cli.arguments import check_output
-from nerif.cli.commands.displacement import print_views
+from nerif.cli.measuring import MeasuringSettings, print_views
 from nerif.cli.output import counting_bar, say
-from nerif.cli.settings import Settings, command
+from nerif.cli.settings import command
 from nerif.common.conventions import InputError
+from nerif.common.files import ending
 from nerif.common.installation import quoted, word_of
 from nerif.common.interruption import if_interrupted
 from nerif.common.locks import locked
-from nerif.common.settings import Count, Flat, Positional
+from nerif.common.settings import Count, Flat, Natural, Positional
 from nerif.imaging.imaging_settings import Surroundings
 from nerif.imaging.vectors.vector_settings import VectorSettings
 
@@ -29,7 +28,7 @@ UNRECORDED = ("out", "force", "config", "frame", "frame_rate")  # the last two a
 
 
 @dataclass(frozen=True)
-class Vectors(Settings):
+class Vectors(MeasuringSettings):
     """Read displacement vectors of PIVlab, OpenPIV, DaVis, Insight, Dynamic Studio, or of any table or arrays.
 
     FOLDER has a folder or a file for each view, named as its camera; numbered files are the frames of a film. Or it is
@@ -39,17 +38,9 @@ class Vectors(Settings):
 
     folder: Annotated[Path, Positional]
     """Folder with the vectors of all views, or a file."""
-    calibration: Path
-    """Calibrated cameras with the names of the views: output of nerif calibrate, or any file that it imports."""
     out: Path
     """Measurement to write, NAME.nc, with a figure NAME.png; for a film NAME.zarr."""
-    lower: tuple[float, float, float] | None = None
-    """Lower corner x y z of the box to reconstruct, mm (default: box of the calibration)."""
-    upper: tuple[float, float, float] | None = None
-    """Upper corner x y z of the box, mm."""
-    views: tuple[str, ...] = ()
-    """Views to use (default: all)."""
-    frame: Annotated[int, Ge(0)] = 0
+    frame: Natural = 0
     """Number of the frame, or of the first of a film, from 0."""
     average: Count = 1
     """Number of frames, from --frame on, whose vectors are averaged."""
@@ -68,7 +59,7 @@ def run(settings: Vectors) -> Measurement:
     from nerif.imaging.vectors.vectors import VectorFilm
 
     out, image = settings.out, settings.out.with_suffix(".png")
-    film = out.suffix.lower() == ".zarr"
+    film = ending(out) == ".zarr"
     check_output(
         out, settings.force or film, *(() if film else (image,)), endings=(".nc", ".zarr")
     )  # a film is continued

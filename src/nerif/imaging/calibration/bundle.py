@@ -36,6 +36,7 @@ PRINCIPAL_SIGMA = 0.03  # of the principal point from the middle of the image, o
 DISTORTION_SIGMA = (0.5, 5.0, 0.005, 0.005, 5.0)  # of COEFFICIENTS; of a telecentric camera with (x, y) over
 HALF_WIDTHS = 5  # times half the image width in mm: as for a perspective image that is 23 degrees wide
 MIN_EIGENVALUE = 1e-13  # of the curvature, over its largest: directions below it change no image
+MAX_ITERATIONS = 100
 INTRINSIC, POSE = 11, 6  # parameters: fx, fy, cx, cy, five of distortion, two of tilt; rotation vector, translation
 
 
@@ -195,7 +196,7 @@ class CameraBundle:
 
 
 def adjust(
-    bundle: CameraBundle, observations: Sequence[TargetObservation], noise: float, iterations: int = 100
+    bundle: CameraBundle, observations: Sequence[TargetObservation], noise: float
 ) -> tuple[CameraBundle, Float[np.ndarray, "camera 17 17"]]:
     """Return the adjusted bundle, and the covariance of each camera's parameters.
 
@@ -208,7 +209,7 @@ def adjust(
     layout = _ParameterOrder(bundle, observations, noise)
     x, damping, stalls = layout.pack(bundle), 1e-3, 0
     cost, curvature, slope = layout.normal_equations(x)
-    for _ in range(iterations):
+    for _ in range(MAX_ITERATIONS):
         scale = _scale(curvature)
         matrix = curvature / scale[:, None] / scale + damping * np.eye(len(x))
         trial = x - cho_solve(cho_factor(matrix), slope / scale) / scale

@@ -28,6 +28,7 @@ __all__ = ["Vectors", "correlate", "normalised_median_outliers", "window_correla
 MIN_VARIANCE = 1e-4  # of a window, relative to the mean
 BINNINGS = 8, 4, 2  # before the images themselves
 SMOOTH, COARSE = 0.7, 6.0  # px, standard deviations of the means between which the detail of a binned image lies
+OUTLIER, OUTLIER_NOISE = 2.0, 0.1  # of the normalised deviation from the median of the neighbours; px
 MIN_PEAK = 0.1  # of the correlation, which is 1 where both windows are equal
 
 
@@ -171,10 +172,10 @@ def _peak(surface: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.stack([top[a] - size // 2 + fit(a) for a in range(dimensions, 0, -1)], axis=-1), height
 
 
-def normalised_median_outliers(vectors: np.ndarray, threshold: float = 2.0, noise: float = 0.1) -> np.ndarray:
-    """Return which vectors (*nodes, d) differ from the median of their 8 or 26 neighbours by more than `threshold`.
+def normalised_median_outliers(vectors: np.ndarray) -> np.ndarray:
+    """Return which vectors (*nodes, d) differ from the median of their 8 or 26 neighbours too much.
 
-    |d - median| / (median |d_i - median| + noise) > threshold, `noise` in px (Westerweel & Scarano 2005).
+    |d - median| / (median |d_i - median| + OUTLIER_NOISE) > OUTLIER      (Westerweel & Scarano 2005)
     """
     vectors, nodes = as_float(vectors), vectors.shape[:-1]
     padded = np.pad(vectors, (*((1, 1),) * len(nodes), (0, 0)), constant_values=np.nan)
@@ -186,8 +187,8 @@ def normalised_median_outliers(vectors: np.ndarray, threshold: float = 2.0, nois
         ]
     )
     median = _nanmedian(around)
-    ratio = np.abs(vectors - median) / (_nanmedian(np.abs(around - median)) + noise)
-    return np.asarray(np.sqrt((ratio**2).sum(axis=-1)) > threshold)
+    ratio = np.abs(vectors - median) / (_nanmedian(np.abs(around - median)) + OUTLIER_NOISE)
+    return np.asarray(np.sqrt((ratio**2).sum(axis=-1)) > OUTLIER)
 
 
 def _nanmedian(values: np.ndarray) -> np.ndarray:

@@ -125,6 +125,8 @@ class Reference:
 
         `region` is where the background is visible.
         """
+        from scipy.ndimage import binary_dilation
+
         settings, reach = self.settings, self.settings.reach
         overexposed = self.overexposed.copy()
         shake, shift = np.zeros(1), (0, 0)
@@ -148,7 +150,7 @@ class Reference:
             sigma, source = np.sqrt(scatter**2 + np.maximum(sigma**2 - without_flow**2, 0)), "repeats"
         sigma = np.sqrt(sigma**2 + smoothing_error(d, reach) ** 2 + difference / 2).astype(np.float32)
         inside_reference = _shown(total)
-        exposed = ~_dilated(overexposed, 2)
+        exposed = ~binary_dilation(overexposed, iterations=2)
         conditions = {
             OVEREXPOSED: exposed,
             "outside the reference": inside_reference,
@@ -270,9 +272,3 @@ def _repeat_sigma(
     factor = (1 / averages + 1 / count) / (1 + 1 / (count - 1))
     gradients = (np.sqrt(variance / repeats) + FLOOR) * np.sqrt(repeats * factor)
     return (np.sqrt(pooled * factor) + FLOOR).astype(np.float32), gradients.astype(np.float32)
-
-
-def _dilated(mask: np.ndarray, iterations: int) -> np.ndarray:
-    from scipy.ndimage import binary_dilation
-
-    return np.asarray(binary_dilation(mask, iterations=iterations))

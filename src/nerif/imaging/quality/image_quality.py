@@ -86,19 +86,16 @@ def shrink(image: np.ndarray, largest: int) -> np.ndarray:
     return np.asarray(cv2.resize(as_float(image), (width, height), interpolation=cv2.INTER_AREA))
 
 
-def jpeg_address(image: np.ndarray, largest: int, white: float = 0.0) -> str:
-    """Return a grey image as a JPEG in a data address, its longer side at most `largest` px.
+def jpeg_address(image: np.ndarray, largest: int) -> str:
+    """Return a grey image (row, column) from 0 as a JPEG in a data address, its longer side at most `largest` px.
 
-    Parameters
-    ----------
-    image : (row, column) grey values from 0
-    white : grey value shown white; 0 for one just above almost all values
+    White is just above almost all grey values.
     """
     import cv2
 
     small = shrink(image, largest)
     quantile, ratio = WHITE
-    top = white or max(float(np.quantile(small, quantile)) * ratio, 1e-9)
+    top = max(float(np.quantile(small, quantile)) * ratio, 1e-9)
     grey = np.clip(small.astype(np.float32) * (255 / top), 0, 255).round().astype(np.uint8)
     _, data = cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     return "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode()

@@ -3,28 +3,24 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
 
 import numpy as np
-from annotated_types import Ge
 
 from nerif.common.conventions import InputError
-from nerif.common.settings import check_settings
+from nerif.common.settings import Natural, check_settings
 from nerif.imaging.readers.frames import size_in_words
 
 __all__ = ["Crop"]
-
-Pixels = Annotated[int, Ge(0)]
 
 
 @dataclass(frozen=True)
 class Crop:
     """A part of each frame, such as one end of a fibre bundle: cropped, then rotated, then flipped."""
 
-    row: Pixels = 0  #: of the top-left pixel
-    column: Pixels = 0  #: of the top-left pixel
-    height: Pixels = 0  #: px; 0 for all up to the edge of the frame
-    width: Pixels = 0  #: px; 0 for all up to the edge of the frame
+    row: Natural = 0  #: of the top-left pixel
+    column: Natural = 0  #: of the top-left pixel
+    height: Natural = 0  #: px; 0 for all up to the edge of the frame
+    width: Natural = 0  #: px; 0 for all up to the edge of the frame
     flip: str = ""  #: "", "horizontal" (exchanges left and right), "vertical" or "both"
     rotate: int = 0  #: 0, 90, 180 or 270 degrees counter-clockwise
 

@@ -83,7 +83,7 @@ def read_text_vectors(path: Path, settings: VectorSettings) -> ProgramVectors:
         missing |= _flagged(settings.columns[4], table.values[:, columns["flag"]])
     elif not table.names:
         missing |= _flags_without_name(table.values)
-    up, mirrored = _y_up(program, x, y, units["x"])
+    up, mirrored = _y_up(program, x, y)
     scale = time_step = 0.0
     origin = None
     if program is INSIGHT:
@@ -160,7 +160,7 @@ def _flags_without_name(values: np.ndarray) -> np.ndarray:
     return np.any([c != 0 for c in flags], axis=0) if flags else np.zeros(len(values), dtype=bool)
 
 
-def _y_up(program: Program, x: np.ndarray, y: np.ndarray, unit: str) -> tuple[bool, bool]:
+def _y_up(program: Program, x: np.ndarray, y: np.ndarray) -> tuple[bool, bool]:
     """Return whether y points up, and whether it is mirrored on the grid instead of the image."""
     if program in (INSIGHT, DANTEC):
         return True, False

@@ -20,7 +20,7 @@ from nerif.data.cameras_file import CalibratedCamera
 from nerif.data.measurement import Measurement
 from nerif.data.measurement_sequence import MeasurementSequence, check_instants
 from nerif.geometry import Box
-from nerif.imaging.calibration.importers.importers import import_box, import_cameras
+from nerif.imaging.calibration.importers.importers import box_to_reconstruct, import_cameras
 from nerif.imaging.calibration.importers.names import cameras_by_view
 from nerif.imaging.displacement.displacement import DisplacementMap
 from nerif.imaging.imaging_settings import Surroundings
@@ -157,13 +157,7 @@ class VectorFilm:
         """
         source, calibration = Path(source), Path(calibration)
         settings, cameras = settings or VectorSettings(), import_cameras(calibration)
-        box = box or import_box(calibration)
-        if box is None:
-            raise InputError(
-                f"expected the corners of the box to reconstruct, since {calibration} has none; give --lower X Y Z and "
-                "--upper X Y Z, mm",
-                field="lower, upper",
-            )
+        scene = Scene(box_to_reconstruct(box, calibration), surroundings or Surroundings())
         frames = _frames_by_view(source, settings, [camera.name for camera in cameras])
         by_view = cameras_by_view([*frames], cameras, say)
         if unknown := [name for name in views or frames if name not in frames]:
@@ -183,7 +177,7 @@ class VectorFilm:
         if len(lengths) > 1:
             counts = ", ".join(f"{view.name} {len(view)}" for view in opened)
             notes.append(f"note: views have different numbers of frames ({counts}); the first {min(lengths)} are used")
-        return cls(tuple(opened), Scene(box, surroundings or Surroundings()), tuple(notes))
+        return cls(tuple(opened), scene, tuple(notes))
 
     def measure(
         self, numbers: Sequence[int] = (0,), on_view: Callable[[int], None] = lambda count: None

@@ -24,13 +24,13 @@ from numba import njit, prange
 from torch import Tensor
 
 from nerif.fields.network import Network
+from nerif.fields.spline_kernel import FASTMATH
 from nerif.reconstruction.device import share_threads
 
 __all__ = ["value_and_gradient"]
 
 share_threads()  # before Numba compiles
 TILE = 4096  # points
-FASTMATH = {"reassoc", "contract", "nsz", "arcp"}
 
 
 @njit("void(f4[:, ::1], f4[:, ::1], f4[:, ::1], f4[:, ::1])", parallel=True, fastmath=FASTMATH, cache=True)

@@ -6,10 +6,10 @@ import math
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from annotated_types import Ge, Gt
+from annotated_types import Gt
 
 from nerif.common.conventions import InputError
-from nerif.common.settings import Checked, Developer, NonNegative, Positive
+from nerif.common.settings import Checked, Developer, Natural, NonNegative, Positive
 from nerif.fields.network_shape import NetworkShape
 from nerif.forward.model_names import AUTO, MODEL_NAMES
 from nerif.geometry.symmetry_names import NO_SYMMETRY
@@ -60,7 +60,7 @@ class TrainingSettings(SharedSettings):
     samples: tuple[int, int] = (0, 0)
     """Samples M per ray at the start and at the end; each step draws N from M - jitter to M + jitter (0 0: 12 24, or
     24 48 for a symmetric flow and one camera)."""
-    sample_jitter: Annotated[int, Ge(0)] = 4
+    sample_jitter: Natural = 4
     """Half-range of the random number of samples per ray, see samples."""
     sampling: Literal["adaptive", "random", "shifted", "regular"] = "adaptive"
     """Sample positions: adaptive (dense where the field varies), or in equal intervals: random (one draw per interval,
@@ -68,7 +68,7 @@ class TrainingSettings(SharedSettings):
     source: Source = "auto"
     """Data to fit: displacements, images (pixel by pixel, after a start from displacements or blurred
     images), both, or auto (images where available)."""
-    lens_rays: Annotated[int, Ge(0)] = 0
+    lens_rays: Natural = 0
     """Rays per pixel through the aperture at the end, even; a third of them at the start (0: 2 to 12, by the width
     of the cone in pixels)."""
     points_per_batch: Annotated[int, Gt(0)] = 8192
@@ -92,7 +92,7 @@ class TrainingSettings(SharedSettings):
     epochs: NonNegative = 0.0
     """Limit in passes over all rays, n_outer of the paper (0: none). Without any limit the run ends when the residual
     on withheld rays stops falling."""
-    max_steps: Annotated[int, Ge(0)] = 0
+    max_steps: Natural = 0
     """Limit in steps (0: none)."""
     first_cycle: Annotated[int, Gt(0), Developer] = 400
     """Steps before the first convergence check of a run without a limit; doubled after each check."""

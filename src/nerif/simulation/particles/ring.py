@@ -14,21 +14,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Annotated
 
 import torch
-from annotated_types import Gt, Lt
 from jaxtyping import Float
 from torch import Tensor
 
 from nerif.common.conventions import InputError
-from nerif.common.settings import check_settings
+from nerif.common.settings import Length, check_settings
 from nerif.geometry import Box
 from nerif.simulation.particles.cloud import Particles
 
 __all__ = ["VortexRing"]
 
-Length = Annotated[float, Gt(0), Lt(math.inf)]
 SEGMENTS = 128  # of the circle
 MIN_CORE = 0.05  # of the radius: thinner cores need more segments
 CHUNK = 2048  # points at a time

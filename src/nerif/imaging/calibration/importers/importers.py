@@ -30,7 +30,7 @@ from nerif.imaging.calibration.importers.yaml_files import ENDINGS as YAML
 from nerif.imaging.calibration.importers.yaml_files import read_yaml_files
 from nerif.imaging.readers.views import VIEWS
 
-__all__ = ["import_box", "import_cameras", "is_calibration", "read_interfaces"]
+__all__ = ["box_to_reconstruct", "import_box", "import_cameras", "is_calibration", "read_interfaces"]
 
 STANDARD = ImportSettings()
 READERS = {".toml": read_tables, ".json": read_transforms}
@@ -128,6 +128,18 @@ def import_box(path: Path, settings: ImportSettings = STANDARD) -> Box | None:
         return box
     (a, b, c), (d, e, f) = (torch.tensor([box.lower, box.upper], dtype=torch.float64) * settings.scale_mm).tolist()
     return Box((a, b, c), (d, e, f))
+
+
+def box_to_reconstruct(box: Box | None, calibration: Path) -> Box:
+    """Return the given box, else that of the calibration; InputError if there is neither."""
+    box = box or import_box(calibration)
+    if box is None:
+        raise InputError(
+            f"expected the corners of the box to reconstruct, since {calibration} has none; give --lower X Y Z and "
+            "--upper X Y Z, mm",
+            field="lower, upper",
+        )
+    return box
 
 
 def _lens(lens: Lens | None, settings: ImportSettings) -> Lens | None:

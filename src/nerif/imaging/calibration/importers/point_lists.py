@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from nerif.common.conventions import InputError
+from nerif.common.text_tables import UNIT
 from nerif.data.cameras_file import CalibratedCamera
 from nerif.imaging.calibration.calibration_settings import ImportSettings
 from nerif.imaging.calibration.importers.dlt import pixel_axes
@@ -19,7 +19,6 @@ from nerif.imaging.calibration.importers.sheet import Sheet
 __all__ = ["is_point_list", "read_point_list"]
 
 NAMES, WORLD, IMAGE = ("camera", "view", "name"), ("x", "y", "z"), ("u", "v")
-UNIT = re.compile(r"\s*[\[(]([^\])]*)[\])]")
 PIXELS = ("", "px", "pixel", "pixels")
 OUTLIER, MIN_OUTLIER = 5, 0.1  # times the typical error; px
 
