@@ -13,10 +13,12 @@ import xarray as xr
 from nerif.common.conventions import InputError
 from nerif.data.measurement import Measurement
 from nerif.data.measurement_file import variables
+from nerif.data.measurement_sequence import MeasurementSequence
 from nerif.data.volume import Volume
 from nerif.forward.deflection import Deflection
 from nerif.forward.registry import TECHNIQUES
-from nerif.geometry import Grid, Lens, Ring
+from nerif.geometry import Box, Grid, Lens, Ring
+from nerif.geometry.interfaces import Interface
 from nerif.simulation.simulate import simulate
 from refusals import refused
 
@@ -351,3 +353,15 @@ def test_netcdf_3_is_read_as_version_4(full, tmp_path, version):
         words = "(not a readable NetCDF file|expected NetCDF-4 .* nccopy -k 4 classic.nc)"
         with pytest.raises(InputError, match=f"classic.nc: {words}"):
             Measurement.read(path)
+
+
+def test_a_store_is_not_continued_behind_another_window(tmp_path: Path) -> None:
+    camera = Ring(views=1, image_size=(6, 7)).cameras()[0]
+    glass, water = (replace(camera, interfaces=(Interface(camera.rotation[2], -200.0, n),)) for n in (1.5, 1.33))
+    flow = Measurement(cameras=(glass,), displacement=torch.zeros(1, 6, 7, 2), box=Box.cube(50.0), n_ambient=1.00027)
+    store = MeasurementSequence.create(tmp_path / "film.zarr", (0.0,), flow)
+    store.write_frame(0, flow)
+    store.check_cameras([glass])
+    for other in (water, camera):
+        with pytest.raises(InputError, match="got other interfaces of view"):
+            store.check_cameras([other])

@@ -13,10 +13,12 @@ import torch
 import xarray as xr
 
 from nerif.common.conventions import InputError
+from nerif.common.settings import merge
 from nerif.data.volume import FORMATS, Volume, export, write_netcdf
 from nerif.data.volume_file import read_volume, read_volumes
 from nerif.geometry import Box, Grid
-from nerif.physics.gas import GasChanges, GasSettings
+from nerif.physics.gas import GasSettings
+from nerif.physics.media import MediumChanges
 from nerif.physics.medium import derive
 from refusals import refused
 
@@ -47,9 +49,10 @@ def test_masked_voxels_are_counted_and_explained(volumes):
 
 def test_the_gas_is_that_of_the_run_unless_changed():
     run = {"gas": {"composition": "CO2", "wavelength_nm": 633.0, "pressure_pa": 9e4}}
-    assert GasChanges().of(run) == GasSettings("CO2", 633.0, 9e4)
-    assert GasChanges(pressure_pa=8e4).of(run) == GasSettings("CO2", 633.0, 8e4)
-    assert GasChanges("N2").of({}) == GasSettings("N2")
+    changes = MediumChanges()
+    assert changes.of(run) == GasSettings("CO2", 633.0, 9e4)
+    assert merge(changes, {"gas.pressure_pa": 101325.0}).of(run) == GasSettings("CO2", 633.0)
+    assert merge(changes, {"gas.composition": "N2"}).of({}) == GasSettings("N2")
 
 
 def test_volumes_of_netcdf_3(volumes, tmp_path):

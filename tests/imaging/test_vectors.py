@@ -111,7 +111,7 @@ def test_vectors_point_to_the_reference(name: str, rig: Rig, tmp_path: Path) -> 
     torch.testing.assert_close(m.displacements[m.usable], rig.truth.displacements[m.usable], rtol=0, atol=1e-5)
 
 
-def test_film_of_numbered_files_and_its_mean(rig: Rig, tmp_path: Path) -> None:
+def test_film_of_numbered_files_and_its_mean(rig: Rig, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rng = np.random.default_rng(1)
     for view, grid in zip(VIEWS, rig.grids(0.0), strict=True):
         for i in range(12):  # frame 10 is behind frame 9
@@ -126,7 +126,9 @@ def test_film_of_numbered_files_and_its_mean(rig: Rig, tmp_path: Path) -> None:
     assert mean.sigma is not None
     assert STEP * float(mean.sigma[mean.usable].median()) == pytest.approx(0.1 / 11**0.5, rel=0.1)
     out = tmp_path / "film.zarr"
-    words = ("vectors", tmp_path, "--calibration", rig.calibration, "--out", out, "--frame-rate", 500, "--window")
+    calibration = tmp_path.with_suffix(".toml")
+    calibration.write_bytes(rig.calibration.read_bytes())
+    words = ("vectors", tmp_path, "--calibration", calibration, "--out", out, "--frame-rate", 500, "--window")
     assert not run(*words, WINDOW)
     sequence = MeasurementSequence.read(out)
     assert sequence.times[1] == pytest.approx(0.002)
@@ -135,6 +137,11 @@ def test_film_of_numbered_files_and_its_mean(rig: Rig, tmp_path: Path) -> None:
     assert not run(*words, WINDOW)  # nothing is left to do
     assert before == {path: path.stat().st_mtime_ns for path in (out / "displacement" / "c").rglob("*")}
     assert run(*words, WINDOW + 1) == 2  # a store of other settings
+    turned = [replace(rig.cameras[0], rotation=rig.cameras[1].rotation), rig.cameras[1]]
+    write_cameras(calibration, [CalibratedCamera.from_camera(c) for c in turned], box=rig.truth.box)
+    capsys.readouterr()
+    assert run(*words, WINDOW) == 2  # a new calibration of the same name
+    assert "got other rotation of view 'cam2'" in capsys.readouterr().err
     stored = sequence.frame(11)
     torch.testing.assert_close(stored.displacements[stored.usable], last.displacements[last.usable])
 
@@ -272,7 +279,9 @@ def test_doubtful_scales_windows_and_calibrations_are_named(
     """Displacements beyond the window, vectors in a corner of the image, a window of a fraction of a pixel."""
     for view in VIEWS:
         _text(tmp_path, f"{view}.csv", _rows(step=2, names="x,y,u [m s-1],v [m s-1]"))
-    words = ("vectors", tmp_path, "--calibration", rig.calibration, "--out", tmp_path.parent / "d.nc", "--sigma", 0.1)
+    calibration = tmp_path.with_suffix(".toml")
+    calibration.write_bytes(rig.calibration.read_bytes())
+    words = ("vectors", tmp_path, "--calibration", calibration, "--out", tmp_path.parent / "d.nc", "--sigma", 0.1)
     assert not run(*words, "--scale", 1.0, "--time-step", 1.0, "--window", 0.16)
     text = capsys.readouterr().out
     assert "u and v in m/s" in text
@@ -288,7 +297,9 @@ def test_a_cut_file_and_a_wrong_scale_are_noticed(
         _text(tmp_path, f"{view}.csv", _rows())
     whole = (tmp_path / "cam5.csv").read_text().splitlines()
     _text(tmp_path, "cam5.csv", "\n".join(whole[:-18]))
-    words = ("vectors", tmp_path, "--calibration", rig.calibration, "--out", tmp_path.parent / "cut.nc", "--sigma", 0.1)
+    calibration = tmp_path.with_suffix(".toml")
+    calibration.write_bytes(rig.calibration.read_bytes())
+    words = ("vectors", tmp_path, "--calibration", calibration, "--out", tmp_path.parent / "cut.nc", "--sigma", 0.1)
     assert not run(*words)
     assert (
         "note: views with fewer rows or columns of vectors than others: cam5 (6, 9) of (8, 9)"

@@ -11,6 +11,7 @@ import xarray as xr
 
 from commands import run
 from nerif.common.conventions import InputError
+from nerif.common.settings import merge
 from nerif.data.volume import Volume
 from nerif.data.volume_file import read_volumes
 from nerif.geometry import Box, Grid
@@ -173,7 +174,7 @@ def test_a_medium_is_stored_and_read() -> None:
     with pytest.raises(InputError, match=unused):
         MediumSettings(water=WaterSettings(ambient_c=30.0))
     with pytest.raises(InputError, match=unused):
-        MediumChanges(water=WaterSettings(ambient_c=30.0)).of({})
+        merge(MediumChanges(), {"water.ambient_c": 30.0}).of({})
     with pytest.raises(InputError, match=r"expected gas with --gas.composition, got plasma"):
         MediumSettings(medium="plasma", gas=GasSettings(composition="CO2"))
     assert [v.quantity for v in derive_all(volume([0.0], 1.3345), settings.substance)] == [
@@ -249,8 +250,9 @@ def test_celsius_by_its_names(tmp_path: Path, head: str) -> None:
 
 def test_changes_to_the_medium_of_a_result_begin_with_it() -> None:
     stored = MediumSettings(medium="mixture", mixture=MixtureSettings(jet="CO2", temperature_k=350.0)).medium_entries
-    changed = MediumChanges(medium="mixture", mixture=MixtureSettings(pressure_pa=9e4)).of(stored)
-    assert changed == MixtureSettings(jet="CO2", temperature_k=350.0, pressure_pa=9e4)
+    default = MixtureSettings().temperature_k
+    changed = merge(MediumChanges(), {"mixture.pressure_pa": 9e4, "mixture.temperature_k": default}).of(stored)
+    assert changed == MixtureSettings(jet="CO2", temperature_k=default, pressure_pa=9e4)
     assert MediumChanges(medium="plasma").of(stored) == PlasmaSettings()
 
 

@@ -7,11 +7,13 @@ from dataclasses import replace
 import pytest
 import torch
 
+from nerif.common.settings import merge
 from nerif.data.volume import Volume
 from nerif.fields.phantoms import make_phantom
 from nerif.geometry import Box, Grid
-from nerif.physics.gas import NOT_UNIFORM, GasChanges, GasSettings
+from nerif.physics.gas import NOT_UNIFORM, GasSettings
 from nerif.physics.gas_optics import ambient_index
+from nerif.physics.media import MediumChanges
 from nerif.physics.medium import derive, derive_all, deviation
 from refusals import refused
 
@@ -64,8 +66,9 @@ def test_uniform_pressure_follows_from_the_field_unless_stated():
     both = flow(torch.tensor([1e-5, -1e-5] * 12).reshape(2, 3, 4))
     assert GasSettings().absent(both) == {"temperature": NOT_UNIFORM}
     assert GasSettings().absent(flow(torch.full((2, 3, 4), -1e-5))) == {}
-    assert GasChanges(uniform_pressure="yes").of({"gas": {"uniform_pressure": "no"}}).uniform_pressure == "yes"
-    assert GasChanges().of({"gas": {"uniform_pressure": "no"}}).uniform_pressure == "no"
+    stated = {"gas": {"uniform_pressure": "no"}}
+    assert merge(MediumChanges(), {"gas.uniform_pressure": "yes"}).of(stated).uniform_pressure == "yes"
+    assert MediumChanges().of(stated).uniform_pressure == "no"
 
 
 BURNT = "N2:0.72, H2O:0.19, CO2:0.09"

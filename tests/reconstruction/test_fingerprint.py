@@ -11,7 +11,7 @@ from nerif.data.measurement import Measurement
 from nerif.fields.network_shape import NetworkShape
 from nerif.forward.registry import technique
 from nerif.geometry import Box
-from nerif.reconstruction.field_files import fingerprint
+from nerif.reconstruction.field_files import check_fingerprint, fingerprint
 from nerif.reconstruction.neural.neural import NeRIF
 from nerif.reconstruction.reconstructor import Reconstructor, State
 from nerif.reconstruction.voxels.tikhonov import Tikhonov
@@ -84,6 +84,12 @@ def test_the_uncertainty_of_poses_is_data_where_they_are_refined(measurement, me
     with refused("resume") as error:
         refined(uncertain, resume=State({}, {"fingerprint": parts[0]}))
     assert "pose_sigma" in str(error.value)
+
+
+def test_parts_that_the_data_no_longer_have_are_named():
+    with refused("resume") as error:
+        check_fingerprint({"box": "a", "ambient_region": "b"}, {"box": "a"})
+    assert "ambient_region" in str(error.value)
 
 
 def test_constants_of_the_forward_model_are_data(ball, cameras, box):

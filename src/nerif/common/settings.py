@@ -33,8 +33,8 @@ from nerif.common.files import check_known
 
 __all__ = [
     "FORMER", "MISSING", "Append", "Checked", "Count", "Developer", "Flat", "Length", "Natural", "NoOption",
-    "NonNegative", "Option", "OptionName", "Positional", "Positive", "check_settings", "converted", "merge",
-    "options", "with_present_names",
+    "NonNegative", "Option", "OptionName", "Positional", "Positive", "changes_to", "check_settings", "converted",
+    "merge", "options", "with_present_names",
 ]  # fmt: skip
 
 T = TypeVar("T")
@@ -335,8 +335,17 @@ def _shown(hint: Any) -> str:
 
 
 @functools.cache
+def changes_to(settings: type) -> type:
+    """Return a class of changes to settings: the same fields, each None where nothing is changed."""
+    names = [(name, hint | None, None) for name, hint in _hints(settings).items()]
+    namespace = {"__post_init__": check_settings, "settings": settings}
+    return dataclasses.make_dataclass(f"ChangesTo{settings.__name__}", names, frozen=True, namespace=namespace)
+
+
+@functools.cache
 def _texts(cls: type) -> dict[str, str]:
     """Return the texts below the fields of a class, by name."""
+    cls = getattr(cls, "settings", cls)
     try:
         body = typing.cast(ast.ClassDef, ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0]).body
     except (OSError, TypeError):  # a class without source

@@ -13,6 +13,9 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+import torch
+from torch import Tensor
+
 from nerif.common.conventions import InputError, within
 from nerif.common.files import atomic, read_json, reading
 from nerif.common.installation import optional
@@ -20,8 +23,10 @@ from nerif.common.memory import check_memory
 from nerif.common.times import check_interval, interval, seconds
 from nerif.data.kinds import SEQUENCE, known_conventions, reading_as
 from nerif.data.measurement import Measurement
-from nerif.data.measurement_file import BODIES, CONVENTIONS, PLAIN, map_names, variables
+from nerif.data.measurement_file import BODIES, CONVENTIONS, PLAIN, from_dataset, map_names, variables
 from nerif.forward.registry import TECHNIQUES
+from nerif.geometry import Camera, Lens
+from nerif.geometry.interfaces import MAX_INTERFACES
 
 if TYPE_CHECKING:
     import numpy as np
@@ -38,6 +43,7 @@ WRITTEN = "written"
 MEASUREMENTS = ("a measurement over time", WRITTEN)
 BYTES_OF_TIME = 64  # of an instant in a tuple
 MAX_FRAMES_SEARCHED = 20  # for one with all views
+ROUNDING = 1e-9  # relative to the largest of the numbers compared
 
 
 def require_store(path: Path, expected: str) -> None:
@@ -181,6 +187,24 @@ class MeasurementSequence:
             raise InputError("exists already with other settings; give another --out, or --force", field=path)
         return sequence
 
+    def check_cameras(self, cameras: Sequence[Camera]) -> None:
+        """Refuse to continue the store with other cameras."""
+        with _opened(self.path) as dataset:
+            stored = {c.name: c for c in from_dataset(dataset.isel(time=0, row=slice(1), column=slice(1)))["cameras"]}
+        differences = [f"views ({', '.join(stored)})"] if set(stored) != {camera.name for camera in cameras} else []
+        for camera in cameras if not differences else ():
+            reference = _camera_numbers(stored[camera.name])
+            for what, value in _camera_numbers(camera).items():
+                tolerance = ROUNDING * float(value.nan_to_num().abs().max())
+                if not torch.allclose(value, reference[what], rtol=0, atol=tolerance, equal_nan=True):
+                    differences.append(f"{what} of view '{camera.name}'")
+        if differences:
+            raise InputError(
+                f"expected the cameras of the existing store, got other {differences[0]}; after a new calibration "
+                "give another --out, or --force",
+                field=self.path,
+            )
+
     def record(self, name: str, settings: dict[str, Any]) -> None:
         """Store the settings with which the frames are made, for `resumed`."""
         import zarr
@@ -307,3 +331,24 @@ def check_instants(times: Sequence[float], field: str | Path) -> None:
     first = next((k for k, (a, b) in enumerate(pairwise(times)) if not b > a), 0)
     short = ", ".join(map(repr, map(float, times[first : first + 4]))) or "none"
     raise InputError(f"coordinate time: expected increasing instants in s, got {short} from frame {first}", field=field)
+
+
+def _camera_numbers(camera: Camera) -> dict[str, Tensor]:
+    """Everything about a camera that a measurement stores."""
+    lens = camera.lens if camera.lens is not None and camera.lens.wide else Lens()
+    sigma = torch.full((6,), torch.nan) if camera.pose_sigma is None else camera.pose_sigma
+    planes = [x for plane in camera.interfaces for x in (*plane.normal.tolist(), plane.offset, plane.index)]
+    groups: dict[str, Any] = {
+        "image size": camera.image_size,
+        "projection": [camera.projection.shows_depth],
+        "intrinsics": camera.intrinsics,
+        "rotation": camera.rotation,
+        "translation": camera.translation,
+        "distortion": camera.distortion,
+        "tilt": camera.tilt,
+        "background": [*camera.plane.normal.tolist(), camera.plane.offset],
+        "lens": [lens.diameter, torch.nan if lens.focus is None else lens.focus],
+        "interfaces": planes + [torch.nan] * (5 * MAX_INTERFACES - len(planes)),
+        "pose_sigma": sigma,
+    }
+    return {what: torch.as_tensor(value, dtype=torch.float64) for what, value in groups.items()}

@@ -8,15 +8,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import torch
-from torch import Tensor
-
 from nerif.common.conventions import InputError
 from nerif.common.times import frame_range
 from nerif.data.measurement import Measurement
-from nerif.data.measurement_file import from_dataset
 from nerif.data.measurement_sequence import MeasurementSequence
-from nerif.geometry import Camera, Lens
 from nerif.imaging.readers.views import OFFSET, View, words_of_range
 from nerif.imaging.recording import Recording, Scene, ViewReference, join_views, reported, silent
 from nerif.imaging.workers import work
@@ -25,7 +20,6 @@ __all__ = ["frame_numbers", "instants_of", "measure_frame", "measure_recording",
 
 NAME = "displacement"
 """Attribute of a store with the settings of its measurement."""
-ROUNDING = 1e-9  # relative to the largest of the numbers compared
 
 
 def references_of(
@@ -119,7 +113,7 @@ def measure_recording(
         say(f"note: {note}")
     references = references_of(recording, say, on_step, processes)
     if sequence is not None:
-        _check_cameras(out, [view.camera for view in references])
+        sequence.check_cameras([view.camera for view in references])
         count = sum(map(sequence.is_written, range(len(numbers))))
         say(f"{out}: {count} of {len(numbers)} frames exist already")
     else:
@@ -136,46 +130,6 @@ def measure_recording(
             say(f"frame {numbers[todo[i]]}: left out: {line}")
     say(f"{out}: {len(numbers)} frames of {len(references)} views, {incomplete} of them incomplete")
     return sequence
-
-
-def _check_cameras(out: Path, cameras: Sequence[Camera]) -> None:
-    """Refuse to continue a store with other cameras."""
-    import xarray as xr
-
-    with xr.open_dataset(out, engine="zarr", chunks=None, consolidated=False, decode_times=False) as dataset:
-        stored = {c.name: c for c in from_dataset(dataset.isel(time=0, row=slice(1), column=slice(1)))["cameras"]}
-    differences = [f"views ({', '.join(stored)})"] if set(stored) != {camera.name for camera in cameras} else []
-    for camera in cameras if not differences else ():
-        reference = _camera_numbers(stored[camera.name])
-        for what, value in _camera_numbers(camera).items():
-            tolerance = ROUNDING * float(value.nan_to_num().abs().max())
-            if not torch.allclose(value, reference[what], rtol=0, atol=tolerance, equal_nan=True):
-                differences.append(f"{what} of view '{camera.name}'")
-    if differences:
-        raise InputError(
-            f"expected the cameras of the existing store, got other {differences[0]}; after a new calibration "
-            "give another --out, or --force",
-            field=out,
-        )
-
-
-def _camera_numbers(camera: Camera) -> dict[str, Tensor]:
-    """Everything about a camera that a measurement stores."""
-    lens = camera.lens if camera.lens is not None and camera.lens.wide else Lens()
-    sigma = torch.full((6,), torch.nan) if camera.pose_sigma is None else camera.pose_sigma
-    groups: dict[str, Any] = {
-        "image size": camera.image_size,
-        "projection": [camera.projection.shows_depth],
-        "intrinsics": camera.intrinsics,
-        "rotation": camera.rotation,
-        "translation": camera.translation,
-        "distortion": camera.distortion,
-        "tilt": camera.tilt,
-        "background": [*camera.plane.normal.tolist(), camera.plane.offset],
-        "lens": [lens.diameter, torch.nan if lens.focus is None else lens.focus],
-        "pose_sigma": sigma,
-    }
-    return {what: torch.as_tensor(value, dtype=torch.float64) for what, value in groups.items()}
 
 
 def _create(

@@ -6,9 +6,8 @@ rho = (n - 1) / K,      T = p M / (R rho)
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
 
@@ -29,7 +28,7 @@ if TYPE_CHECKING:
     from nerif.data.measurement import Measurement
     from nerif.data.volume import Volume
 
-__all__ = ["NOT_UNIFORM", "TEMPERATURE_RANGE", "GasChanges", "GasSettings"]
+__all__ = ["NOT_UNIFORM", "TEMPERATURE_RANGE", "GasSettings"]
 
 TEMPERATURE_RANGE = 200.0, 4000.0  #: K; outside, gases of the table condense or dissociate
 AMBIENT_RANGE = 200.0, 2000.0  # K, of the gas around a flow
@@ -182,23 +181,3 @@ class GasSettings(Medium):
         density = density_from_index(np.array(of_flow), n_ambient, self._constant)
         cold, hot = temperature_from_density(density, self.pressure_pa, molar_mass(self.composition))
         return -float(low), float(high), float(cold), math.inf if math.isnan(hot) else float(hot)
-
-
-@dataclass(frozen=True)
-class GasChanges:
-    """Changes to the gas of a result."""
-
-    composition: str | None = None
-    """Gas or mixture by mole fractions, e.g. "CH4:0.11, air:0.89"; default: that of the result."""
-    wavelength_nm: float | None = None
-    """Wavelength of the light, nm; default: that of the result."""
-    pressure_pa: float | None = None
-    """Pressure, Pa; default: that of the result."""
-    uniform_pressure: Literal["auto", "yes", "no"] | None = None
-    """Whether the pressure is uniform, so that temperature follows from density; default: that of the result."""
-
-    def of(self, settings: Mapping[str, Any]) -> GasSettings:
-        """Return the gas in the settings of a run (run.toml) with the changes."""
-        changes = {name: value for name, value in vars(self).items() if value is not None}
-        stored = {name: value for name, value in settings.get("gas", {}).items() if name in vars(self)}
-        return GasSettings(**stored | changes)

@@ -7,9 +7,9 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any, Literal, Self
 
 from nerif.common.conventions import InputError
-from nerif.common.settings import check_settings
+from nerif.common.settings import changes_to, check_settings
 from nerif.data.quantity_names import INDEX
-from nerif.physics.gas import GasChanges, GasSettings
+from nerif.physics.gas import GasSettings
 from nerif.physics.isentropic import IsentropicSettings
 from nerif.physics.medium import Medium
 from nerif.physics.mixture import MixtureSettings
@@ -28,22 +28,8 @@ MEDIA: Mapping[str, type[Medium]] = {
 }  # fmt: skip
 
 
-@dataclass(frozen=True)
 class _Media:
-    """The settings of each medium."""
-
-    medium: str = ""
-    gas: Any = None
-    mixture: MixtureSettings = field(default_factory=MixtureSettings)
-    """Two gases that mix, for --medium mixture."""
-    isentropic: IsentropicSettings = field(default_factory=IsentropicSettings)
-    """Gas from a reservoir, for --medium isentropic."""
-    water: WaterSettings = field(default_factory=WaterSettings)
-    """Water, for --medium water."""
-    table: TableSettings = field(default_factory=TableSettings)
-    """A table of the index, for --medium table."""
-    plasma: PlasmaSettings = field(default_factory=PlasmaSettings)
-    """A plasma, for --medium plasma."""
+    """The settings of each medium, and the name of the one in use."""
 
     def _check_unused(self, medium: str) -> None:
         """Refuse settings of a medium that is not in use."""
@@ -51,8 +37,7 @@ class _Media:
             group = getattr(self, name)
             changed = [f.name for f in fields(group) if getattr(group, f.name) != getattr(type(group)(), f.name)]
             if name != medium and changed:
-                option = f"--{name}.{changed[0].replace('_', '-')}"
-                raise InputError(f"expected {name} with {option}, got {medium}", field="medium")
+                raise InputError(f"expected {name} with {option_of(name, changed[0])}, got {medium}", field="medium")
 
 
 @dataclass(frozen=True)
@@ -64,6 +49,16 @@ class MediumSettings(_Media):
     (another liquid), plasma (docs/media.md)."""
     gas: GasSettings = field(default_factory=GasSettings)
     """Gas for density and temperature."""
+    mixture: MixtureSettings = field(default_factory=MixtureSettings)
+    """Two gases that mix, for --medium mixture."""
+    isentropic: IsentropicSettings = field(default_factory=IsentropicSettings)
+    """Gas from a reservoir, for --medium isentropic."""
+    water: WaterSettings = field(default_factory=WaterSettings)
+    """Water, for --medium water."""
+    table: TableSettings = field(default_factory=TableSettings)
+    """A table of the index, for --medium table."""
+    plasma: PlasmaSettings = field(default_factory=PlasmaSettings)
+    """A plasma, for --medium plasma."""
 
     def __post_init__(self) -> None:
         check_settings(self)
@@ -100,22 +95,28 @@ class MediumChanges(_Media):
 
     medium: Literal["", *MEDIA] = ""  # type: ignore[valid-type]
     """Medium of the flow; default: that of the result."""
-    gas: GasChanges = field(default_factory=GasChanges)
-    """Gas for density and temperature."""
+    gas: Any = field(default_factory=changes_to(GasSettings))
+    mixture: Any = field(default_factory=changes_to(MixtureSettings))
+    isentropic: Any = field(default_factory=changes_to(IsentropicSettings))
+    water: Any = field(default_factory=changes_to(WaterSettings))
+    table: Any = field(default_factory=changes_to(TableSettings))
+    plasma: Any = field(default_factory=changes_to(PlasmaSettings))
 
     def of(self, settings: Mapping[str, Any]) -> Medium:
         """Return the medium in the settings of a run (run.toml) with the changes."""
-        self._check_unused(self.medium or "gas")
-        stored = stored_medium(settings)
-        if self.medium and self.medium != "gas":
-            group = getattr(self, self.medium)
-            if not isinstance(stored, type(group)):
-                return replace(group)
-            values = {f.name: getattr(group, f.name) for f in fields(group)}
-            return replace(stored, **{k: value for k, value in values.items() if value != getattr(type(group)(), k)})
-        if not self.medium and stored is not None and not isinstance(stored, GasSettings):
-            return stored
-        return self.gas.of(settings)
+        stored = stored_medium(settings) or GasSettings()
+        name = self.medium or next(name for name, kind in MEDIA.items() if type(stored) is kind)
+        self._check_unused(name)
+        changes = {key: value for key, value in vars(getattr(self, name)).items() if value is not None}
+        try:
+            return replace(stored, **changes) if type(stored) is MEDIA[name] else MEDIA[name](**changes)
+        except InputError as error:
+            raise error.renamed({key: option_of(name, key) for key in changes}) from None
+
+
+def option_of(medium: str, name: str) -> str:
+    """Return the option of a setting of a medium."""
+    return f"--{medium}.{name.replace('_', '-')}"
 
 
 def stored_medium(entries: Mapping[str, Any]) -> Medium | None:

@@ -88,7 +88,7 @@ def check_fingerprint(before: dict[str, str] | None, present: dict[str, str]) ->
             "start without --resume",
             field="resume",
         )
-    changed = [name for name in present if before.get(name) != present[name]]
+    changed = [name for name in dict.fromkeys([*present, *before]) if before.get(name) != present.get(name)]
     if changed:
         raise InputError(
             f"expected the data of the run to be resumed, got other {', '.join(changed)}; "

@@ -11,6 +11,7 @@ from nerif.cli.arguments import check_output
 from nerif.cli.output import counting_bar, say
 from nerif.cli.settings import Settings, command
 from nerif.common.conventions import InputError
+from nerif.common.files import ending
 from nerif.common.locks import locked
 from nerif.common.settings import Natural, Positional
 
@@ -64,12 +65,12 @@ def run(settings: BodyInFlow) -> Measurement:
     from nerif.data.measurement_sequence import MeasurementSequence
     from nerif.imaging.bodies import with_bodies, without_bodies
 
-    out, film = settings.out, settings.measurement.suffix == ".zarr"
-    ending = ".zarr" if film else ".nc"
+    out, film = settings.out, ending(settings.measurement) == ".zarr"
+    last = ".zarr" if film else ".nc"
     if out is None:
-        raise InputError(f"expected the measurement to write, NAME{ending}, got none", field="out")
+        raise InputError(f"expected the measurement to write, NAME{last}, got none", field="out")
     image = out.with_suffix(".bodies.png")
-    check_output(out, settings.force, image, endings=(ending,))
+    check_output(out, settings.force, image, endings=(last,))
     _check(settings, film)
     measurement = MeasurementSequence.read(settings.measurement).fullest() if film else None
     measurement = measurement or Measurement.read(settings.measurement)
@@ -147,7 +148,7 @@ def _bodies(settings: BodyInFlow, measurement: Measurement) -> list[Body]:
     for path in settings.models:
         read = read_body(path, settings.unit or "mm", lambda line: say(f"note: {line}"))
         body = read.moved(rotation, translation)
-        if settings.refine and settings.measurement.suffix != ".zarr":
+        if settings.refine and ending(settings.measurement) != ".zarr":
             check_size(measurement, body, settings.unit is not None)
             pose = refine_pose(measurement, body, silhouettes, 0 if silhouettes is not None else settings.margin)
             say(pose.sentence)

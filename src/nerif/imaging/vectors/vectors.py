@@ -230,6 +230,7 @@ class VectorFilm:
         entries = json.loads(json.dumps({**(settings or {}), "times": times}, default=str))
         if Path(out).exists() and not force:
             sequence = MeasurementSequence.resumed(Path(out), NAME, entries)
+            sequence.check_cameras(self.measure((numbers[0],))[0].cameras)
         else:
             sequence = MeasurementSequence.create(out, times, self.measure((numbers[0],))[0], force)
             sequence.record(NAME, entries)
