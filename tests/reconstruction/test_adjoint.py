@@ -38,8 +38,12 @@ MATRIX = [(name, geometry, "cubic") for name in MODELS for geometry in ("thin", 
 MATRIX += [("deflection", geometry, basis) for geometry in (*LENSES, *SYMMETRIES) for basis in ("linear", "cubic")]
 MATRIX += [(name, "thin", "linear") for name in ("absorption", "knife")]
 MATRIX = sorted(set(MATRIX))
-COMPILED = [  # each is compiled for several seconds: of techniques of others the simplest is enough
-    pytest.param(*m, marks=pytest.mark.slow) if m[0] in ("knife", "cubic") and m[1:] != ("thin", "cubic") else m
+# each is compiled for several seconds: of techniques of others, and of the linear basis, the simplest are enough
+SIMPLEST = [(name, "thin", "cubic") for name in ("knife", "cubic")] + [("deflection", "thin", "linear")]
+COMPILED = [
+    m
+    if m in SIMPLEST or (m[0] not in ("knife", "cubic") and m[2] == "cubic")
+    else pytest.param(*m, marks=pytest.mark.slow)
     for m in MATRIX
 ]
 EVERY = pytest.mark.parametrize(("name", "geometry", "basis"), COMPILED)
