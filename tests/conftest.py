@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 # ruff: noqa: E402
+import gc
 import itertools
 import math
 import os
@@ -82,6 +83,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         group[item] = shared[0] if shared else item.path.stem
         item.add_marker(pytest.mark.xdist_group(group[item]))
     items.sort(key=lambda item: LONGEST.index(group[item]) if group[item] in LONGEST else len(LONGEST))
+
+
+def pytest_collection_finish() -> None:
+    """Modules and tests stay: no collection of garbage goes through them."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture
