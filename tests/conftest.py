@@ -53,8 +53,8 @@ WHOLE += ("test_docs", "test_examples", "test_asymmetry", "test_convergence", "t
 """Files and folders of tests that run whole commands: what these call is checked call by call in the other tests."""
 
 
-DRAWN = "report", "plotting", "test_cli_images", "test_cli_simple"
-"""Folders of tests whose figures are rendered; of others only in make test-all: rendering takes half of a command."""
+DRAWN = "report", "plotting", "app", "test_cli_images", "test_cli_simple", "test_patterns", "test_telecentric"
+"""Folders and files of tests whose figures are rendered; of others only in slow tests and in make test-all."""
 
 
 @pytest.hookimpl(wrapper=True)
@@ -63,15 +63,15 @@ def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
     whole = item.path.stem in WHOLE or item.path.parent.name in WHOLE
     jaxtyping.config.update("jaxtyping_disable", whole)
     with pytest.MonkeyPatch.context() as patch:
-        if not ALL and not {item.path.stem, item.path.parent.name} & {*DRAWN}:
+        if not (ALL or item.get_closest_marker("slow") or {item.path.stem, item.path.parent.name} & {*DRAWN}):
             patch.setattr(Figure, "savefig", _blank)
         return (yield)
 
 
-def _blank(figure: Figure, file: Path | BytesIO, **_: object) -> None:
+def _blank(figure: Figure, file: str | Path | BytesIO, **_: object) -> None:
     """Leave a file without an image."""
-    if isinstance(file, Path):
-        file.touch()
+    if not isinstance(file, BytesIO):
+        Path(file).touch()
 
 
 @pytest.hookimpl(tryfirst=True)  # before xdist reads the groups
