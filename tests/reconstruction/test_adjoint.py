@@ -39,13 +39,9 @@ MATRIX += [("deflection", geometry, basis) for geometry in (*LENSES, *SYMMETRIES
 MATRIX += [(name, "thin", "linear") for name in ("absorption", "knife")]
 MATRIX = sorted(set(MATRIX))
 # each is compiled for several seconds: of techniques of others, and of the linear basis, the simplest are enough
-SIMPLEST = [(name, "thin", "cubic") for name in ("knife", "cubic")] + [("deflection", "thin", "linear")]
-COMPILED = [
-    m
-    if m in SIMPLEST or (m[0] not in ("knife", "cubic") and m[2] == "cubic")
-    else pytest.param(*m, marks=pytest.mark.slow)
-    for m in MATRIX
-]
+QUICK = [m for m in MATRIX if m[2] == "cubic" and m[0] not in ("knife", "cubic")]
+QUICK += [("knife", "thin", "cubic"), ("cubic", "thin", "cubic"), ("deflection", "thin", "linear")]
+COMPILED = [m if m in QUICK else pytest.param(*m, marks=pytest.mark.slow) for m in MATRIX]
 EVERY = pytest.mark.parametrize(("name", "geometry", "basis"), COMPILED)
 IN_SPACE = pytest.mark.parametrize(
     ("name", "geometry", "basis"), [c for c, m in zip(COMPILED, MATRIX, strict=True) if m[1] in LENSES]

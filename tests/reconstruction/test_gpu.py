@@ -145,21 +145,19 @@ RUNS["symmetric"] = replace(
 RUNS["refined"] = replace(RUNS["fast"], refine=("cameras", "shift"), max_steps=3)
 RUNS["bounded"] = replace(RUNS["fast"], upper=0.0)
 RUNS["voxels"] = TotalVariation(voxels=6, iterations=1, regularisation=1e-3, device=str(GPU))
-LONG = ("refined", "voxels")
-ELSEWHERE = ("curved", "symmetric", "bounded")  # without double precision, which mixes no devices either
+LONG = ("refined", "voxels", "curved", "symmetric", "bounded")  # those without double precision mix no devices either
 
 
 @pytest.mark.parametrize(
     ("name", "lens"),
     [
-        *((name, None) for name in RUNS if name not in LONG + ELSEWHERE),
+        *((name, None) for name in RUNS if name not in LONG),
         ("fast", Lens(12.0)),
         *(
             pytest.param("fast", Lens(window=3.0), marks=pytest.mark.slow),
             pytest.param("paper", Lens(12.0), marks=pytest.mark.slow),
         ),
         *(pytest.param(name, lens, marks=pytest.mark.slow) for name in LONG for lens in (None, Lens(12.0))),
-        *(pytest.param(name, None, marks=pytest.mark.slow) for name in ELSEWHERE),
     ],
 )
 def test_no_run_mixes_devices_or_rounds_outside_the_network(measurement, gpu, name, lens):
