@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 # ruff: noqa: E402
+import gc
 import itertools
 import math
 import os
 from collections.abc import Callable, Iterator
+from io import BytesIO
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -17,6 +19,7 @@ import jaxtyping
 import pytest
 import torch
 from jaxtyping import install_import_hook
+from matplotlib.figure import Figure
 
 ROOMS = "geometry", "fields", "data", "physics", "imaging", "simulation", "reconstruction", "flow", "analysis", "report"
 # what Numba compiles stays as it is written; schedule holds no array, and is asked many times a step
@@ -25,9 +28,8 @@ SOURCE = Path(__file__).parents[1] / "src" / "nerif"
 FILES = [p for room in ROOMS for p in (SOURCE / room).rglob("[!_]*.py") if p.stem not in UNCHECKED]
 CHECKED = [".".join(p.relative_to(SOURCE).with_suffix("").parts) for p in FILES]
 CHECKED += ["common.conventions", "forward.path_integral", "forward.ray_tracing", "workflow.sequence"]
-if os.environ.get(
-    "NERIF_CHECK_SHAPES"
-):  # make test-all: shapes in annotations, on every call; before nerif is imported
+ALL = bool(os.environ.get("NERIF_CHECK_SHAPES"))  # make test-all
+if ALL:  # shapes in annotations, on every call; before nerif is imported
     install_import_hook([f"nerif.{part}" for part in CHECKED], "typecheck.check")
 
 from nerif.data.measurement import Measurement
@@ -51,12 +53,25 @@ WHOLE += ("test_docs", "test_examples", "test_asymmetry", "test_convergence", "t
 """Files and folders of tests that run whole commands: what these call is checked call by call in the other tests."""
 
 
+DRAWN = "report", "plotting", "app", "test_cli_images", "test_cli_simple", "test_patterns", "test_telecentric"
+"""Folders and files of tests whose figures are rendered; of others only in slow tests and in make test-all."""
+
+
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
     """Check shapes by annotation, but not where whole commands run: that takes a sixth of their time."""
     whole = item.path.stem in WHOLE or item.path.parent.name in WHOLE
     jaxtyping.config.update("jaxtyping_disable", whole)
-    return (yield)
+    with pytest.MonkeyPatch.context() as patch:
+        if not (ALL or item.get_closest_marker("slow") or {item.path.stem, item.path.parent.name} & {*DRAWN}):
+            patch.setattr(Figure, "savefig", _blank)
+        return (yield)
+
+
+def _blank(figure: Figure, file: str | Path | BytesIO, **_: object) -> None:
+    """Leave a file without an image."""
+    if not isinstance(file, BytesIO):
+        Path(file).touch()
 
 
 @pytest.hookimpl(tryfirst=True)  # before xdist reads the groups
@@ -68,6 +83,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         group[item] = shared[0] if shared else item.path.stem
         item.add_marker(pytest.mark.xdist_group(group[item]))
     items.sort(key=lambda item: LONGEST.index(group[item]) if group[item] in LONGEST else len(LONGEST))
+
+
+def pytest_collection_finish() -> None:
+    """Modules and tests stay: no collection of garbage goes through them."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from contextlib import nullcontext
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -28,6 +29,7 @@ ABOUT_Z = Symmetry.about("axis", (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), 0.1)
 QUICK = ["--symmetry", "axis", "--method", "tikhonov", "--voxels", "20", "--no-report"]
 
 
+@cache
 def measured(phantom, noise=0.0, views=1):
     cameras, box = paper_rig(40)
     return simulate(make_phantom(phantom, box, 0), cameras[:views], box, 1.00027, noise, 0)

@@ -128,10 +128,11 @@ def through_windows(cameras: tuple[Camera, ...], behind: float) -> tuple[Camera,
 @pytest.mark.parametrize("behind", [1.0, pytest.param(1.333, marks=pytest.mark.slow)])
 def test_targets_seen_through_windows_give_the_rig_back(tmp_path, behind):
     """With a tank the world seems nearer, with air behind the pane it is shifted: both come out as they are."""
-    cameras = through_windows(CAMERAS, behind)
-    views = target_images(cameras, TARGET, 0, 10, 0)
+    cameras = through_windows(CAMERAS[1:3], behind)
+    views = target_images(cameras, TARGET, 0, 8, 0)
     windows = {camera.name: camera.interfaces for camera in cameras}
-    result = calibrate(views, SETTINGS["perspective"], 480.0, windows)
+    settings = replace(SETTINGS["perspective"], axes=world_axes(cameras))
+    result = calibrate(views, settings, 480.0, windows)
     assert result.rms() < 1e-4
     assert turns(result, cameras).max() < 2e-3
     result.write(tmp_path / "c.toml")
@@ -143,7 +144,7 @@ def test_targets_seen_through_windows_give_the_rig_back(tmp_path, behind):
             < 5e-3
         )
     if behind == 1.0:
-        ignored = calibrate(views, SETTINGS["perspective"], 480.0)
+        ignored = calibrate(views, settings, 480.0)
         assert turns(ignored, cameras).max() > 20 * turns(result, cameras).max()
 
 
@@ -419,7 +420,7 @@ def small(kind: str) -> tuple[CameraBundle, list[TargetObservation]]:
         bundle.intrinsics[:, 4:9] = (1e-6, 1e-10, 1e-6, 2e-6, 1e-14)
         return bundle, observations
     pair = CAMERAS[1:3]
-    poses = target_poses(pair, TARGET, 4, seed=3)
+    poses = target_poses(pair, TARGET, 4, seed=3)[: 3 if kind == "windows" else 4]
     observations = [
         TargetObservation(i, j, detection(camera, TARGET, pose, 0.0, rng))
         for i, camera in enumerate(pair)

@@ -11,7 +11,6 @@ from PIL import Image
 
 from bodies import ball, cuboid
 from nerif.cli.cli import main
-from nerif.data.body_file import read_body
 from nerif.data.measurement import Measurement
 from nerif.data.measurement_sequence import MeasurementSequence
 from nerif.fields.phantoms import make_phantom
@@ -179,8 +178,3 @@ def test_the_pose_in_each_frame_is_refined(flow, film, tmp_path):
         expected = turned(BRICK, shift=shift).vertices.mean(dim=0)
         torch.testing.assert_close(body.vertices.mean(dim=0), expected, atol=0.2, rtol=0)
     assert not bool(whole.frame(0).usable.all())
-
-
-def test_a_written_model_is_read_as_it_was(tmp_path):
-    write_stl(tmp_path / "brick.stl", BRICK)
-    assert read_body(tmp_path / "brick.stl").volume == pytest.approx(BRICK.volume)

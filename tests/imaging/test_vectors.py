@@ -45,7 +45,7 @@ class Rig:
             for c in self.cameras
         )
         field = make_phantom("flame", box, 1)
-        self.truth: Measurement = simulate(field, coarse, box, 1.00027)
+        self.truth: Measurement = simulate(field, coarse, box, 1.00027, steps=40)
         self.missing = np.zeros((len(VIEWS), *shape), dtype=bool)
         self.missing[:, 3:5, 6] = True
 

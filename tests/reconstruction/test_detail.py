@@ -261,6 +261,7 @@ def test_the_gaussian_process_stops_on_request_and_at_its_limit(plume):
     assert (short.voxels, whole) == (12, small)
 
 
+@pytest.mark.slow
 def test_total_variation_leaves_detail_too(plume):
     truth, measurement = plume
     assert isinstance(measurement, Measurement)

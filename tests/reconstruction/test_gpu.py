@@ -135,8 +135,8 @@ def test_projections_are_on_the_device_of_the_rays(measurement, ball, gpu):
 
 
 SHAPE = NetworkShape(depth=2, width=8, octaves=2, skip=1, head_width=4, gradient_head=True)
-SMALL = {"device": str(GPU), "compile": "off", "max_steps": 6, "samples": (6, 8), "sample_jitter": 1}
-SMALL |= {"points_per_batch": 400, "epochs": 0.0, "stop_ratio": 0.0}
+SMALL = {"device": str(GPU), "compile": "off", "max_steps": 4, "samples": (6, 8), "sample_jitter": 1}
+SMALL |= {"points_per_batch": 200, "epochs": 0.0, "stop_ratio": 0.0}
 RUNS = {name: replace(p, network=SHAPE, **SMALL) for name, p in PRESETS.items()}
 RUNS["curved"] = replace(RUNS["fast"], model="curved")
 RUNS["symmetric"] = replace(
@@ -144,8 +144,8 @@ RUNS["symmetric"] = replace(
 )
 RUNS["refined"] = replace(RUNS["fast"], refine=("cameras", "shift"), max_steps=3)
 RUNS["bounded"] = replace(RUNS["fast"], upper=0.0)
-RUNS["voxels"] = TotalVariation(voxels=8, iterations=2, regularisation=1e-3, device=str(GPU))
-LONG = ("refined", "voxels")
+RUNS["voxels"] = TotalVariation(voxels=6, iterations=1, regularisation=1e-3, device=str(GPU))
+LONG = ("refined", "voxels", "curved", "symmetric", "bounded")  # those without double precision mix no devices either
 
 
 @pytest.mark.parametrize(
@@ -170,7 +170,7 @@ def test_no_run_mixes_devices_or_rounds_outside_the_network(measurement, gpu, na
 
 
 RUNS["default"] = replace(PRESETS["fast"], **(SMALL | {"max_steps": 3}))
-RUNS["Tikhonov"] = Tikhonov(voxels=8, iterations=2, regularisation=1e-3)
+RUNS["Tikhonov"] = Tikhonov(voxels=6, iterations=1, regularisation=1e-3)
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n == "refined" else n for n in RUNS])

@@ -100,7 +100,7 @@ def test_conjugate_gradients_reach_the_posterior_mean(white, prior):
 
 def test_draws_have_mean_and_covariance_of_the_posterior(white, prior):
     mean, covariance = analytic(white)
-    generator, count = torch.Generator().manual_seed(11), 40
+    generator, count = torch.Generator().manual_seed(11), 20
     z = mean.reshape(SHAPE)
     draws = torch.stack([after(white.draw(z, generator), ITERATIONS).flatten() for _ in range(count)])
     matrix = fields(prior)

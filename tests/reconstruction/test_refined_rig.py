@@ -224,7 +224,7 @@ def test_trials_refine_rigs_of_their_own_which_are_read_again(measured, tmp_path
     monkeypatch.setattr("nerif.reconstruction.voxels.descent.ROUNDS", 2)
     monkeypatch.setattr("nerif.reconstruction.uncertainty.bootstrap.VOXELS", 8)
     out, lines, few = ResultDirectory(tmp_path / "r"), [], measured.select(measured.names[::2])
-    method = Tikhonov(voxels=8, iterations=4, regularisation=1e-2, refine=("cameras",), device="cpu")
+    method = Tikhonov(voxels=8, iterations=2, regularisation=1e-2, refine=("cameras",), device="cpu")
     run = RunSettings(withhold=("none",), uncertainty="fast", report=False)
     for resume in (False, True):
         result = reconstruct_into(out.path, few, method, run, resume=resume, monitor=Monitor(lines.append))

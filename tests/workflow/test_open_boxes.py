@@ -24,7 +24,7 @@ WHOLE, CUT = Box.cube(40.0), Box((-20.0, -20.0, -20.0), (20.0, 20.0, 2.0))
 QUIET = RunSettings(report=False, withhold=(), detail="off", extend_open_faces=8.0)
 SHAPE = NetworkShape(depth=2, width=32, octaves=3)
 SHORT = NeRIF(
-    network=SHAPE, samples=(12, 16), points_per_batch=1024, max_steps=150, open_faces=("z+",), device="cpu",
+    network=SHAPE, samples=(12, 16), points_per_batch=1024, max_steps=100, open_faces=("z+",), device="cpu",
     precision="float32",
 )  # fmt: skip
 VOXELS = Tikhonov(voxels=16, open_faces=("z+",), device="cpu")

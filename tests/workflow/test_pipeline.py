@@ -5,8 +5,6 @@ from __future__ import annotations
 import errno
 import os
 import re
-import subprocess
-import sys
 import time
 from contextlib import nullcontext
 from dataclasses import replace
@@ -100,18 +98,19 @@ def test_field_and_volumes_are_written_before_the_reprojection(measurement, tmp_
     assert not out.metrics().views
 
 
-def test_a_second_run_into_the_directory_is_refused_and_leaves_the_first_alone(measurement, tmp_path):
+def test_a_second_run_into_the_directory_is_refused_and_leaves_the_first_alone(measurement, tmp_path, capsys):
     measurement.write(tmp_path / "m.nc")
     out, answers = tmp_path / "r", []
 
     def begin_another(step):
         if step.step == 2:
-            line = [sys.executable, "-m", "nerif", "reconstruct", str(tmp_path / "m.nc"), "--out", str(out), "--force"]
-            answers.append(subprocess.run([*line, "--seed", "7"], capture_output=True, text=True, timeout=100))
+            line = ["reconstruct", str(tmp_path / "m.nc"), "--out", str(out), "--force", "--seed", "7"]
+            answers.append((main(line), capsys.readouterr().err))
 
     reconstruct_into(out, measurement, QUICK, RUN, on_step=begin_another, force=True)
-    assert answers[0].returncode == 2
-    assert f"another run writes to it (process {os.getpid()} on " in answers[0].stderr
+    [(code, error)] = answers
+    assert code == 2
+    assert f"another run writes to it (process {os.getpid()} on " in error
     result = ResultDirectory(out).read()
     assert not result.missing
     assert result.settings["method"] == "tikhonov"

@@ -185,7 +185,7 @@ def test_a_symmetric_film_is_solved_in_the_plane_of_its_axis(tmp_path: Path, mon
         theta = 0.1 * torch.exp(-((r / 6.0) ** 2) - ((h + 4.0 - RISE * t) / 5.0) ** 2)
         store.write(k, [Volume.of((1 - N_AMBIENT) * theta, GRID, "index_excess", N_AMBIENT)])
     out = tmp_path / "v.zarr"
-    settings = VelocityFit(resolution=16, max_iterations=10, time_limit=0, samples=2, sample_iterations=6)
+    settings = VelocityFit(resolution=12, max_iterations=8, time_limit=0, samples=2, sample_iterations=3)
 
     def stop(iterate: FitIterate) -> None:
         if iterate.iterations == 4:

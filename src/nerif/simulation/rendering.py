@@ -124,7 +124,8 @@ def render(
 
 def _rays(camera: Camera, pixels: Float[Tensor, "n 2"], offset: Float[Tensor, 4]) -> Rays:
     """Rays from a point of the lens through the focus of each pixel to the background."""
-    return camera.rays(pixels).through(offset.expand(len(pixels), 1, 4))
+    rays = camera.rays(pixels, sensitivity=False)
+    return rays.through(offset.expand(len(pixels), 1, 4)) if bool(offset.any()) else rays
 
 
 def _shift(field: Field, rays: Rays, plane: Plane, box: Box, n_ambient: float, steps: int) -> Float[Tensor, "n 3"]:

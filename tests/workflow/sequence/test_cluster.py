@@ -49,6 +49,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:unclosed <(socket|ssl):ResourceW
 @pytest.fixture(autouse=True)
 def _sockets_that_dask_leaves() -> Iterator[None]:
     """Collect them here: Dask drops the socket of a connection that it refuses, or that ends as the cluster does."""
+    gc.freeze()  # only what the test makes is looked through
     yield
     gc.collect()
 
