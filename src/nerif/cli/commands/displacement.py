@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from nerif.cli.arguments import check_output
-from nerif.cli.measuring import MeasuringSettings, print_views
+from nerif.cli.measurement import MeasurementSettings, print_views
 from nerif.cli.output import counting_bar, say
 from nerif.cli.settings import command
 from nerif.common.conventions import InputError
@@ -27,7 +27,7 @@ UNRECORDED = ("out", "force", "config", "frames", "frame_offset")  # or recorded
 
 
 @dataclass(frozen=True)
-class Displacement(MeasuringSettings):
+class Displacement(MeasurementSettings):
     """Compute the displacements of all views, and write them with the calibration as a measurement.
 
     Displacement: where a dot appears with flow minus where it appears without (px, u right, v down).

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from nerif.cli.arguments import check_output
-from nerif.cli.measuring import MeasuringSettings, print_views
+from nerif.cli.measurement import MeasurementSettings, print_views
 from nerif.cli.output import counting_bar, say
 from nerif.cli.settings import command
 from nerif.common.conventions import InputError
@@ -28,7 +28,7 @@ UNRECORDED = ("out", "force", "config", "frame", "frame_rate")  # the last two a
 
 
 @dataclass(frozen=True)
-class Vectors(MeasuringSettings):
+class Vectors(MeasurementSettings):
     """Read displacement vectors of PIVlab, OpenPIV, DaVis, Insight, Dynamic Studio, or of any table or arrays.
 
     FOLDER has a folder or a file for each view, named as its camera; numbered files are the frames of a film. Or it is

@@ -14,11 +14,11 @@ from nerif.common.settings import Positional
 if TYPE_CHECKING:
     from nerif.data.measurement import Measurement
 
-__all__ = ["MeasuringSettings", "print_views"]
+__all__ = ["MeasurementSettings", "print_views"]
 
 
 @dataclass(frozen=True)
-class MeasuringSettings(Settings):
+class MeasurementSettings(Settings):
     """Settings of commands that make a measurement of all views."""
 
     folder: Annotated[Path, Positional]
