@@ -42,9 +42,11 @@ def test_points_are_detected_where_they_are(kind, angles):
     assert np.sqrt(np.mean(error**2)) < (0.03 if kind == "circles" else 0.02)
 
 
-@pytest.mark.parametrize(("kind", "turn"), [("chessboard", 180.0), ("chessboard", 90.0), ("charuco", 180.0)])
+@pytest.mark.parametrize(
+    ("kind", "turn"), [("chessboard", 180), ("chessboard", 90), ("charuco", 180), ("circles", -60), ("circles", 80)]
+)
 def test_a_rotated_target_keeps_its_numbers(kind, turn):
-    target = CalibrationTarget(kind, 8, 7, pitch=6.0)
+    target = CalibrationTarget(kind, 7, 6, pitch=6.0)
     assert np.abs(errors(target, *photograph(target, (10, 5, turn)))).max() < 0.2
 
 
@@ -63,12 +65,6 @@ def test_white_on_black(kind):
 def test_a_part_of_a_larger_target_is_not_detected(kind, columns, rows):
     image, _ = photograph(TARGETS[kind], TILTED)
     assert CalibrationTarget(kind, columns, rows, pitch=7.0).detect(image) is None
-
-
-@pytest.mark.parametrize("turn", [-60, 80])
-def test_a_turned_grid_of_dots_keeps_its_numbers(turn):
-    target = CalibrationTarget("circles", 7, 6, pitch=6.0)
-    assert np.abs(errors(target, *photograph(target, (10, 5, turn)))).max() < 0.2
 
 
 def test_dots_and_markers_of_any_size_in_a_large_image():

@@ -187,10 +187,10 @@ def test_a_run_in_water(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
     path, out = tmp_path / "m.nc", tmp_path / "result"
     assert not run(
         "simulate", "--phantom", "gaussians", "--views", 4, "--image-size", 14, 14, "--n-ambient", 1.3345,
-        "--noise", 0.05, "--out", path,
+        "--noise", 0.05, "--steps", 30, "--truth-voxels", 8, "--out", path,
     )  # fmt: skip
     words = ("--medium", "water", "--water.ambient-c", 25)
-    assert not run("reconstruct", path, "--out", out, "--max-steps", 30, "--withhold", "none", "--voxels", 12, *words)
+    assert not run("reconstruct", path, "--out", out, "--max-steps", 5, "--withhold", "none", "--voxels", 12, *words)
     assert "temperature: fresh water at one atmosphere and 532 nm" in capsys.readouterr().out
     page = (out / "report.html").read_text(encoding="utf-8")
     assert '"kind": "table"' in page or '"kind":"table"' in page
@@ -277,9 +277,10 @@ def test_two_results_at_two_wavelengths(tmp_path: Path) -> None:
         path = tmp_path / f"{name}.nc"
         assert not run(
             "simulate", "--views", 4, "--image-size", 14, 14, "--wavelength-nm", light, "--seed", light,
-            "--noise", 0.05, "--out", path,
+            "--noise", 0.05, "--steps", 30, "--truth-voxels", 8, "--out", path,
         )  # fmt: skip
-        words = ("--method", "tikhonov", "--withhold", "none", "--voxels", 10, "--uncertainty", "fast", "--no-report")
+        words = ("--method", "tikhonov", "--withhold", "none", "--voxels", 10, "--uncertainty", "fast", "--no-report",
+                 "--regularisation", 0.01, "--iterations", 10)  # fmt: skip
         assert not run("reconstruct", path, "--out", tmp_path / name, *words)
     first, second = (tmp_path / name for name in names)
     assert not run("export", first, "--out", tmp_path / "p.nc", "--second", second, "--medium", "plasma")
