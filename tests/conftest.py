@@ -73,8 +73,14 @@ def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
     jaxtyping.config.update("jaxtyping_disable", whole)
     with pytest.MonkeyPatch.context() as patch:
         if not (ALL or item.get_closest_marker("slow") or {item.path.stem, item.path.parent.name} & {*DRAWN}):
-            patch.setattr(Figure, "savefig", lambda self, file, **_: isinstance(file, BytesIO) or Path(file).touch())
+            patch.setattr(Figure, "savefig", _blank)
         return (yield)
+
+
+def _blank(figure: Figure, file: str | Path | BytesIO, **_: object) -> None:
+    """Leave a file without an image."""
+    if not isinstance(file, BytesIO):
+        Path(file).touch()
 
 
 @pytest.hookimpl(tryfirst=True)  # before xdist reads the groups
