@@ -51,8 +51,6 @@ LONGEST = ("images", "films", "report", "test_cluster", "test_consistency", "tes
 WHOLE = ("cli", "workflow", "sequence", "mutation", "benchmarks", "report", "app")
 WHOLE += ("test_docs", "test_examples", "test_asymmetry", "test_convergence", "test_refined_rig", "test_residuals")
 """Files and folders of tests that run whole commands: what these call is checked call by call in the other tests."""
-
-
 DRAWN = "report", "plotting", "app", "test_cli_images", "test_cli_simple", "test_patterns", "test_telecentric"
 """Folders and files of tests whose figures are rendered; of others only in slow tests and in make test-all."""
 
