@@ -40,12 +40,12 @@ class Rig:
         self.origin = first * STEP - 0.5
         shape = (int(PIXELS[0] / STEP - 2 * first) + 1, int(PIXELS[1] / STEP - 2 * first) + 1)
         grid = torch.tensor([[1 / STEP, 0, -self.origin / STEP], [0, 1 / STEP, -self.origin / STEP], [0, 0, 1]])
+        lens = Lens(points=5, window=WINDOW / STEP)
         coarse = tuple(
-            replace(c, intrinsics=grid.double() @ c.intrinsics, image_size=shape, lens=Lens(window=WINDOW / STEP))
-            for c in self.cameras
+            replace(c, intrinsics=grid.double() @ c.intrinsics, image_size=shape, lens=lens) for c in self.cameras
         )
         field = make_phantom("flame", box, 1)
-        self.truth: Measurement = simulate(field, coarse, box, 1.00027, steps=40)
+        self.truth: Measurement = simulate(field, coarse, box, 1.00027, steps=20)
         self.missing = np.zeros((len(VIEWS), *shape), dtype=bool)
         self.missing[:, 3:5, 6] = True
 
